@@ -150,7 +150,7 @@ class _Connection:
             yield
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             kind = TimeoutError if isinstance(error, httpx.TimeoutException) else ConnectionError
-            raise kind(f"{self._url} gives no answer ({error or type(error).__name__})") from None
+            raise kind(f"{self._url} gives no answer ({str(error) or type(error).__name__})") from None
 
     def _parsed(self, response: httpx.Response, parse: Callable[[httpx.Response], T]) -> T:
         """Return what `parse` makes of a response; raise ServiceError if its status is an error."""

@@ -51,7 +51,7 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
         InputError: `run` is of another type or has no classes, a size is not a bucket, or a platform is unknown.
     """
     if not isinstance(run, TrainedRun):
-        raise InputError(f"run is a {type(run).__name__}; expected a TrainedRun, as load_run returns it")
+        raise InputError(f"run is of type {type(run).__name__}; expected a TrainedRun, as load_run returns it")
     for name, value, buckets in (("n_points", n_points, POINT_BUCKETS), ("n_clouds", n_clouds, BATCH_BUCKETS)):
         if value not in buckets:
             raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(str, buckets))}")

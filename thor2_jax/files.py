@@ -28,6 +28,7 @@ from colornet.files import (
     temporary_directory,
 )
 from thor2_jax.errors import InputError, reason_of, refusing_os_errors
+from thor2_jax.printable import first_names
 
 __all__ = [
     "LOCK",
@@ -63,7 +64,7 @@ __all__ = [
 def as_path(path: object, name: str) -> Path:
     """Return the path of a file as a Path; a value of another type, or with a null character, raises InputError."""
     if not isinstance(path, str | os.PathLike):
-        raise InputError(f"{name} is a {type(path).__name__}; expected a path")
+        raise InputError(f"{name} is of type {type(path).__name__}; expected a path")
     if "\0" in str(path):
         raise InputError(f"{name} is {str(path)!r}; expected a path without null characters")
     return Path(path)
@@ -91,7 +92,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
             names = [name for name in names if name not in resumable and not name.startswith(".")]
         if names and not (marker and (directory / marker).is_file()):
             raise InputError(
-                f"out: {directory} already contains {', '.join(names[:3])}; expected a new or empty directory"
+                f"out: {directory} already contains {first_names(names, 3)}; expected a new or empty directory"
                 f"{' or an interrupted run of this command' if marker or resumable else ''}; choose another directory"
             )
         check_writable(directory)

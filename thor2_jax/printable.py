@@ -49,8 +49,8 @@ def find_name(name: str, known: Collection[str]) -> str | None:
 
 
 def first_names(names: Sequence[str], most: int = 6) -> str:
-    """Return the first `most` names as a list in a sentence, with dots for further ones."""
-    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
+    """Return at most `most` names as a list in a sentence: the first ones, with dots for further ones, and the last."""
+    return ", ".join(names if len(names) <= most else [*names[: most - 1], "...", names[-1]])
 
 
 def escape_characters(text: str, can_show: Callable[[str], bool] = str.isprintable) -> str:

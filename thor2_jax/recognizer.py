@@ -86,7 +86,7 @@ class DescribedFrame:
 
 def _check_frames(frames: object) -> None:
     if not isinstance(frames, Iterable):
-        raise InputError(f"frames is a {type(frames).__name__}; expected a list of frames")
+        raise InputError(f"frames is of type {type(frames).__name__}; expected a list of frames")
 
 
 class Recognizer:
@@ -129,7 +129,7 @@ class Recognizer:
                 integer, or `rule` or `answer_by` is unknown.
         """
         if not isinstance(run, TrainedRun):
-            raise InputError(f"run is a {type(run).__name__}; expected a TrainedRun; Recognizer.load reads a directory")
+            raise InputError(f"run is of type {type(run).__name__}; expected a TrainedRun; see Recognizer.load")
         if not is_positive_integer(chunk):
             raise InputError(f"chunk is {chunk!r}; expected a positive integer")
         if embedding is not None:

@@ -109,7 +109,7 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
 
     def _clouds(self, X: Sequence[Any]) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         if isinstance(X, str | bytes) or not isinstance(X, Sequence | np.ndarray) or getattr(X, "ndim", 1) == 0:
-            raise InputError(f"X is a {type(X).__name__}; expected a list of clouds")
+            raise InputError(f"X is of type {type(X).__name__}; expected a list of clouds")
         if len(X) == 0:
             raise InputError("X is empty; expected a list of at least one cloud")
         if isinstance(X, tuple) and len(X) == 2 and getattr(X[0], "shape", 0) == getattr(X[1], "shape", 1):

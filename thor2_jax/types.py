@@ -104,7 +104,7 @@ class PointClouds:
                 message gives the index of the cloud.
         """
         if not isinstance(clouds, Sized) or len(clouds) == 0:
-            actual = "empty" if isinstance(clouds, Sized) else f"a {type(clouds).__name__}"
+            actual = "empty" if isinstance(clouds, Sized) else f"of type {type(clouds).__name__}"
             raise InputError(f"clouds is {actual}; expected a list of at least one pair (xyz, rgb)")
         arrays = [check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
         sizes = [len(xyz) for xyz, _ in arrays]
@@ -128,7 +128,7 @@ class PointClouds:
 
 def _padded_flags(name: str, flags: Sequence[ArrayLike | None], sizes: list[int], n: int) -> NDArray[np.bool_]:
     if not isinstance(flags, Sized) or len(flags) != len(sizes):
-        actual = f"has {len(flags)} entries" if isinstance(flags, Sized) else f"is a {type(flags).__name__}"
+        actual = f"has {len(flags)} entries" if isinstance(flags, Sized) else f"is of type {type(flags).__name__}"
         raise InputError(f"{name} {actual} for {len(sizes)} clouds; expected a list of one entry for each cloud")
     padded = np.zeros((len(sizes), n), bool)
     for i, (size, values) in enumerate(zip(sizes, flags, strict=True)):
@@ -200,7 +200,7 @@ def check_types(**arguments: object) -> None:
     for name, value in arguments.items():
         expected = _TYPES[name]
         if not isinstance(value, expected):
-            raise InputError(f"{name} is a {type(value).__name__}; expected a {expected[0].__name__}")
+            raise InputError(f"{name} is of type {type(value).__name__}; expected a {expected[0].__name__}")
 
 
 def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -211,7 +211,7 @@ def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[n
             or colours out of range.
     """
     if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise InputError(f"{name} is a {type(pair).__name__}; expected a pair (xyz, rgb)")
+        raise InputError(f"{name} is of type {type(pair).__name__}; expected a pair (xyz, rgb)")
     points, colors = as_array(pair[0], f"{name}: xyz"), as_array(pair[1], f"{name}: rgb")
     if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.floating):
         raise InputError(f"{name}: xyz is {points.dtype} {list(points.shape)}; expected floating [n, 3], in metres")

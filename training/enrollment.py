@@ -18,6 +18,7 @@ from thor2_jax.gallery.enrollment import ObjectGallery, embedded_object
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_open_to_changes
 from thor2_jax.model.run_directory import TrainedRun, save_run
+from thor2_jax.printable import first_names
 from training.objects.meshes import load_mesh
 from training.objects.surfaces import surfaces_of
 from training.readers.frames import FrameFolder
@@ -59,7 +60,8 @@ def enroll_objects(
         progress: called with ("enroll", objects done, number of objects, name).
 
     Returns:
-        Object -> number of its views in the gallery; the gallery; and notes on instances and views that were left out.
+        Object -> number of its views in the gallery; the gallery; notes on views that are left out, and on new names
+        with `extend`.
 
     Raises:
         InputError: the run directory cannot be read, the gallery cannot be written, a view cannot be used, the frames
@@ -75,7 +77,7 @@ def enroll_objects(
     if is_new and gallery is not None:
         raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
     added: dict[str, GalleryObject] = {}
-    skipped: Sequence[str] = []
+    notes: list[str] = []
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(atomic_directory(model)) if is_new else model
         if is_new:
@@ -90,7 +92,7 @@ def enroll_objects(
         surfaces: Iterator[Any] = itertools.repeat(None)
         if isinstance(source, FrameFolder):
             instances = read_instances(source, recognizer.run.config.sigma_s, label_name or name, instance)
-            skipped = instances.skipped
+            notes += [f"skipped: {reason}" for reason in instances.skipped]
             views = ([recognizer.model.corrected(view) for view in each] for each in instances.views.values())
             names, kind = [name or each for each in instances.views], "frames"
         else:
@@ -99,12 +101,14 @@ def enroll_objects(
             surfaces = (surfaces_of([load_mesh(file, mesh_scale)]).arrays for file in source.values())
             names, kind = list(source), "mesh"
         names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in names]
+        if extend and (new_names := [each for each in names if each not in objects.gallery.answered_names]):
+            notes.append(f"new, since no object with this name can be extended: {first_names(new_names)}")
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)  # before its views are rendered
             given, surface = next(views), next(surfaces)
             new = objects.new_views(each, given, surface, extend=extend)
             if len(new) < len(given):
-                skipped = [*skipped, f"views of {each} that are repeated or enrolled already: {len(given) - len(new)}"]
+                notes.append(f"skipped: views of {each} that are repeated or enrolled already: {len(given) - len(new)}")
             if new or not given:
                 added[each] = embedded_object(objects.embedding, new, kind, surface)
         progress("enroll", len(names), len(names), "")
@@ -112,7 +116,7 @@ def enroll_objects(
             objects.add(added, extend=extend, replace=replace)
         if is_new and not _is_empty(model):
             raise InputError(f"model: {model} was created by another command meanwhile; repeat this one to add to it")
-    return {each: len(objects.gallery.objects[each].clouds) for each in names}, objects, skipped
+    return {each: len(objects.gallery.objects[each].clouds) for each in names}, objects, notes
 
 
 def _is_empty(directory: Path) -> bool:

@@ -153,15 +153,15 @@ def _is_complete(job: TrainJob, labelled: LabelledInstances | None) -> bool:
     stored = record["dataset"]
     trained = {
         "seed": record["seed"],
+        "leave_out": stored.get("classes_left_out", []),
         "dataset": stored.get("job"),
         "frames": stored.get("frames", {}).get("digest"),
-        "leave_out": stored.get("classes_left_out", []),
     }
     requested = {
         "seed": job.protocol.fit.seed,
+        "leave_out": sorted(set(job.leave_out)),  # before the objects of the dataset, which depend on it
         "dataset": job.protocol.render_job(_kept_meshes(job)).record(),
         "frames": labelled.digest if labelled else None,
-        "leave_out": sorted(set(job.leave_out)),
     }
     check_same_job(job.out, trained, requested)
     files = [baseline_file(run, name) for run in run_directories(job.out) for name in job.baselines]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from thor2_jax import InputError, Recognizer
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.printable import first_names
 from thor2_jax.tracking.viewpoints import ViewTable
 from training.objects.mesh import TexturedMesh
 from training.views.mesh_views import ViewTask, all_views, cloud_of
@@ -40,7 +41,7 @@ def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> Vi
             labels.append(classes.index(name))
             rotations.append(view.pose[:3, :3])
     if not views:
-        raise InputError(f"meshes has none of the classes {', '.join(classes[:5])}, ...; expected some of them")
+        raise InputError(f"meshes has none of the classes {first_names(classes)}; expected some of them")
     _, inference = recognizer.infer(views, answer_by="classifiers")
     probabilities = {name: values[: len(views)] for name, values in inference.probabilities.items()}
     return ViewTable(np.array(labels), np.array(rotations), recognizer.model.fused(probabilities).astype(np.float64))

@@ -79,7 +79,7 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
 def test_invalid_runs_sizes_and_platforms_are_refused(run: TrainedRun) -> None:
     assert_refused("n_points is 500", export_recognizer, run, n_points=500, n_clouds=1)
     assert_refused("n_clouds is 3", export_recognizer, run, n_points=512, n_clouds=3)
-    for given, message in (("run", "run is a str"), (untrained_run((), ()), "run has no classes")):
+    for given, message in (("run", "run is of type str"), (untrained_run((), ()), "run has no classes")):
         assert_refused(message, export_recognizer, given, n_points=512, n_clouds=1)
     for platforms in (("abacus",), ()):
         assert_refused("platforms is", export_recognizer, run, n_points=512, n_clouds=1, platforms=platforms)

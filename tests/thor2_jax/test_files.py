@@ -51,7 +51,7 @@ def test_a_used_directory_needs_a_marker(tmp_path: Path) -> None:
     )
     files.check_output_directory(tmp_path, "marker")
     (tmp_path / "a").touch()
-    assert_refused("contains .lock, a, marker; expected", files.check_output_directory, tmp_path)
+    assert_refused("contains .lock, a, ..., partial; expected", files.check_output_directory, tmp_path)
 
 
 def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from thor2_jax.printable import check_name, first_names
 
 
 def test_dots_stand_for_further_names_only() -> None:
-    assert [first_names("abc"[:count], 2) for count in range(4)] == ["", "a", "a, b", "a, b, ..."]
+    assert [first_names("abc"[:count], 2) for count in range(4)] == ["", "a", "a, b", "a, ..., c"]
 
 
 @pytest.mark.parametrize("name", ["", " ", "a\nb", "x" * 201, 3, "mug\u200b", "\u3164", "\ud800"])

@@ -101,17 +101,17 @@ def test_answers_below_the_threshold_have_no_name(recognizer: Recognizer, run: T
 
 def test_arguments_that_are_no_frames_are_named(recognizer: Recognizer) -> None:
     for function in (recognizer.recognize, recognizer.describe, recognizer.track().update):
-        assert_refused("frame is a str; expected an RGBDFrame", function, "frame.png")
-    assert_refused("frame is a NoneType", thor2.explain, recognizer, None, 1)
+        assert_refused("frame is of type str; expected an RGBDFrame", function, "frame.png")
+    assert_refused("frame is of type NoneType", thor2.explain, recognizer, None, 1)
     frame = tilted(patches())
-    assert_refused("frames is a RGBDFrame; expected a list", recognizer.enroll, "new", frame)
-    assert_refused("frames is a RGBDFrame; expected a list", recognizer.adapt, frame)
-    assert_refused(r"frames\[0\]: frame is a int", recognizer.enroll, "new", [(2, frame)])
-    assert_refused(r"frames\[0\]: frame is a tuple", recognizer.enroll, "new", [(frame, 2, 3)])
-    assert_refused(r"frames\[1\]: frame is a str", recognizer.adapt, [frame, "frame.png"])
+    assert_refused("frames is of type RGBDFrame; expected a list", recognizer.enroll, "new", frame)
+    assert_refused("frames is of type RGBDFrame; expected a list", recognizer.adapt, frame)
+    assert_refused(r"frames\[0\]: frame is of type int", recognizer.enroll, "new", [(2, frame)])
+    assert_refused(r"frames\[0\]: frame is of type tuple", recognizer.enroll, "new", [(frame, 2, 3)])
+    assert_refused(r"frames\[1\]: frame is of type str", recognizer.adapt, [frame, "frame.png"])
     assert_refused(r"^frames\[0\]: labels is None", recognizer.adapt, [dataclasses.replace(frame, labels=None)])
     assert_refused(r"frames\[0\]: instance is '2'", recognizer.enroll, "new", [(frame, "2")])
-    assert_refused("run is a str", Recognizer, "run")
+    assert_refused("run is of type str", Recognizer, "run")
     assert_refused("^model is 'a.x00b'; expected a path", Recognizer.load, "a\0b")
 
 

@@ -90,10 +90,10 @@ def test_columns_of_data_frames_follow_the_layout(transformer: Any) -> None:
 
 XYZ, RGB = np.zeros((3, 3)), np.zeros((3, 3), np.uint8)
 INVALID: list[tuple[str, Any, dict[str, Any]]] = [
-    ("X is a int", 7, {}),
-    ("X is a str", "cloud", {}),
+    ("X is of type int", 7, {}),
+    ("X is of type str", "cloud", {}),
     ("X is empty", [], {}),
-    ("X[1] is a int", [(XYZ, RGB), 7], {}),
+    ("X[1] is of type int", [(XYZ, RGB), 7], {}),
     ("X[1]: xyz[2] is [nan, nan, nan]", [(XYZ, RGB), (np.array([[0.0] * 3] * 2 + [[np.nan] * 3]), RGB)], {}),
     ("X[0]: xyz has rows of different lengths", [([[0.0, 1.0, 2.0], [0.0]], RGB)], {}),
     ("X[1] has 8193 points", [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))], {}),

@@ -71,7 +71,7 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     ("arguments", "expected"),
     [
         ({"clouds": []}, ["clouds is empty"]),
-        ({"clouds": None}, ["clouds is a NoneType"]),
+        ({"clouds": None}, ["clouds is of type NoneType"]),
         ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
         ({"clouds": [(POINTS, np.zeros((2, 3)))]}, ["clouds[0]", "rgb", "[2, 3]"]),

@@ -124,7 +124,7 @@ def _decided_cloud(explanation: Explanation) -> ExplanationPicture:
     figure, axes = _figure()
     instance = explanation.instance
     plot.cloud(axes, instance.points, instance.colors, explanation.attributions.values, size=_point_size(instance))
-    axes.locator_params(axis="x", nbins=3)  # More numbers of a narrow cloud overlap.
+    axes.set_adjustable("datalim")  # The numbers below a narrow cloud would overlap.
     _color_bar(figure, axes, explanation)
     caption = f"The {len(instance.points)} points of the object as the camera sees them, in the same colours."
     return ExplanationPicture("cloud", "decided", "What decided, on the points", caption, figure)

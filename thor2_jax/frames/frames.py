@@ -177,7 +177,7 @@ class RGBDFrame:
 def check_frame(frame: object) -> None:
     """Raise InputError unless the value is a frame."""
     if not isinstance(frame, RGBDFrame):
-        raise InputError(f"frame is a {type(frame).__name__}; expected an RGBDFrame, as read_frame returns it")
+        raise InputError(f"frame is of type {type(frame).__name__}; expected an RGBDFrame, as read_frame returns it")
 
 
 def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> NDArray[np.float64]:

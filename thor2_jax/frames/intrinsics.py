@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, as_array, decoding, with_context
 from thor2_jax.files import as_path, parse_json, parse_yaml, read_file, read_npy
+from thor2_jax.printable import first_names
 
 __all__ = [
     "DEFAULT_DEPTH_SCALE",
@@ -141,7 +142,7 @@ class Intrinsics:
         if hasattr(values, "distortion_model"):  # a CameraInfo message
             values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
         if not isinstance(values, Mapping):
-            raise InputError(f"intrinsics is a {type(values).__name__}; expected fx, fy, cx, cy, or a 3 x 3 matrix")
+            raise InputError(f"intrinsics is of type {type(values).__name__}; expected fx, fy, cx, cy, or a matrix")
         camera = values["intrinsic"] if isinstance(values.get("intrinsic"), Mapping) else values  # of Open3D
         matrix, scale = _parts(camera)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale
@@ -298,7 +299,7 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any]:
         if has_size and _is_number(scale) and BOP_CAMERA_SCALES[0] <= scale <= BOP_CAMERA_SCALES[1]:
             scale = 1000 / scale  # BOP's camera.json
         return _pinhole_matrix(values, "cx", "cy"), scale
-    shown, expected = ", ".join(map(str, list(values)[:8])) or "no entry", "fx, fy, cx, cy, or a ROS camera_info, K"
+    shown, expected = first_names(list(map(str, values)), 8) or "no entry", "fx, fy, cx, cy, or a ROS camera_info, K"
     raise InputError(f"intrinsics has {shown}; expected {expected}, cam_K, ppx and ppy, or intrinsic_matrix")
 
 

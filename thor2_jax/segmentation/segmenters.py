@@ -70,7 +70,7 @@ def load_segmenter(name: str, others: Sequence[str] = ()) -> Segmenter:
     except Exception as error:
         raise InputError(f"{subject} cannot be imported ({_reason(error)}); check its package") from None
     if not callable(segmenter):
-        raise InputError(f"{subject} is a {type(segmenter).__name__}; expected a function")
+        raise InputError(f"{subject} is of type {type(segmenter).__name__}; expected a function")
     return segmenter
 
 

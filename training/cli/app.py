@@ -24,7 +24,7 @@ from typing import Annotated, Any, NoReturn, TextIO
 
 import typer
 from rich import progress, table
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
 
 from thor2_jax import __version__
 from thor2_jax.errors import InputError, reason_of
@@ -127,10 +127,15 @@ sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.std
 
 
 class _Console(Console):
-    """A console that shows control characters in texts escaped, for instance those in names of folders."""
+    """A console that shows control characters in texts escaped, for instance those in names of folders.
+
+    Text is broken into lines for terminals only, since programs read other output line by line.
+    """
 
     def print(self, *objects: Any, **options: Any) -> None:
-        super().print(*(escape_characters(each) if isinstance(each, str) else each for each in objects), **options)
+        shown = [escape_characters(each) if isinstance(each, str) else each for each in objects]
+        is_read = not self.is_terminal and all(isinstance(each, str) for each in objects)
+        super().print(*shown, **{"soft_wrap": is_read} | options)
 
 
 # Without a terminal, rich would truncate tables at 80 columns. Below 72, it would leave out columns of tables, so
@@ -140,12 +145,18 @@ console = _Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):
-    """A table that folds words that are longer than a column; by default, rich cuts them."""
+    """A table that folds words where rich cuts them, and has no padding if it fits only without."""
 
     def __init__(self, *titles: str, title: str | None = None, folded: Collection[str] | None = None) -> None:
         """Create the table; the columns that are not in `folded` keep their width. By default, all may be folded."""
         fixed = () if folded is None else {*titles} - {*folded}
         super().__init__(*(table.Column(each, overflow="fold", no_wrap=each in fixed) for each in titles), title=title)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        excess = self.__rich_measure__(console, options.update(max_width=10_000)).maximum - options.max_width
+        if 0 < excess <= 2 * len(self.columns):
+            self.padding = 0
+        return super().__rich_console__(console, options)
 
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")

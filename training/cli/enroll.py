@@ -58,8 +58,8 @@ def enroll(
     has_frames = bool(given.arguments())
     if bool(mesh) == has_frames:
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
-    if name is None and (target.label_name is not None or target.instance is not None):
-        raise InputError("name is missing; --label-name and --instance enroll one object")
+    if name is None and any(each is not None for each in (target.label_name, target.instance, given.bag, segment)):
+        raise InputError("name is missing; --label-name, --instance, --bag and --segment enroll one object")
     options.check_alone("replace", target.replace, extend=target.extend)
     options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance, segment=segment)
     scale = options.given_values(target).get("mesh_scale")
@@ -75,9 +75,11 @@ def enroll(
     source = meshes or FrameFolder(frames, named=name is None)
     pool = dataclasses.replace(processes, workers=min(processes.workers, len(meshes) or 1)).pool() or IN_PROCESS
     with show_progress(quiet) as progress:
-        counts, known, skipped = enroll_objects(model, source, name=name, pool=pool, progress=progress, **vars(target))
-    for reason in skipped:
-        console.print(f"skipped: {reason}")
+        counts, known, notes = enroll_objects(model, source, name=name, pool=pool, progress=progress, **vars(target))
+    for note in notes:
+        console.print(note)
+    if target.instance is not None and len(frames) > 1 and (given.bag or segment):
+        console.print(f"warning: {target.instance} may be another object in each frame, since they are segmented apart")
     for each, count in counts.items():
         console.print(f"views of {each}: {count}")
     if known.weak_rejection:

@@ -3,11 +3,12 @@
 import dataclasses
 import functools
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.cells import cell_len
 
 from thor2_jax.printable import first_names
 from training.cli import options
@@ -144,23 +145,14 @@ def _print_report(report: Mapping[str, Any]) -> None:
     from training.evaluation import page
 
     counts, speed = report["instances"], report["speed"]
-    titles, _ = page.marked((report["fusions"], ()), report["main"])
-    shown = Table("", "instances", *titles, title="accuracy without rejection")
-    for table in report["accuracy"][report["rule"]]:
-        header, rows = page.accuracy_table(table, report["fusions"])
-        shown.add_section()
-        if header[0]:
-            shown.add_row(f"by {header[0]}", style="bold")
-        for row in rows:
-            shown.add_row(*row)
-    console.print(shown)
+    overall, *others = (page.accuracy_table(table, report["fusions"]) for table in report["accuracy"][report["rule"]])
+    header, rows = page.marked(overall, report["main"])
+    for (group, *cells), more in others:
+        rows = [*rows, [f"by {group}", *[""] * len(cells)], *more]
+    _print_columns(*((header, rows) if others else page.upright((header, rows))), "accuracy without rejection")
     for table in report["published_tables"]:
         title, text, compared = page.comparison(table, report["main"])
-        header, rows = page.marked(compared, report["main"])
-        shown = Table(*header, title=title)
-        for row in rows:
-            shown.add_row(*row)
-        console.print(shown)
+        _print_columns(*page.marked(compared, report["main"]), title)
         console.print(text)
     console.print(
         f"instances scored: {counts['scored']}; {sum(counts['not_described'].values())} of them could not be described "
@@ -175,3 +167,21 @@ def _print_report(report: Mapping[str, Any]) -> None:
     )
     for text in page.answer_texts(report):
         console.print(text)
+
+
+def _print_columns(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
+    """Print a table; columns that do not fit the console follow in further tables with the same first column."""
+    columns = list(zip(header, *rows, strict=True))
+    widths = [max(map(cell_len, (*column[0].split(), *column[1:]))) + 3 for column in columns]
+    start = 1
+    while start < len(columns):
+        end = start + 1
+        while end < len(columns) and 1 + widths[0] + sum(widths[start : end + 1]) <= console.width:
+            end += 1
+        shown = Table(header[0], *header[start:end], title=title, folded=header[start:end])
+        for row in rows:
+            if not row[1]:
+                shown.add_section()
+            shown.add_row(row[0], *row[start:end], style=None if row[1] else "bold")
+        console.print(shown)
+        start = end

@@ -140,14 +140,18 @@ class FrameOptions:
     every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take every N-th frame.")] = 1
 
     def arguments(self, n_frames: int = 0) -> list[str]:
-        """Return the arguments that pass the same frames to another command; FRAME stands for more than three frames.
+        """Return the arguments that pass the same frames to another command, but not more than three of them.
+
+        FRAME stands for more folders, and only the first frame of a longer recording is passed.
 
         Args:
-            n_frames: number of frames in the given folders, if it is known.
+            n_frames: number of frames in the given folders or the recording, if it is known.
         """
         given = given_values(self)
+        if self.bag is not None and n_frames > 3:
+            given["every"] = n_frames * self.every
         frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in given.pop("frames", ())]
-        return [*(frames if max(len(frames), n_frames) < 4 else ["FRAME"]), *option_arguments(**given)]
+        return [*(frames if self.bag or max(len(frames), n_frames) < 4 else ["FRAME"]), *option_arguments(**given)]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""

@@ -228,8 +228,10 @@ def recognize(
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
-    known, same = f"{model} recognizes {recognizer.gallery.summary}", {"segment": segment, **vars(arguments)}
-    results.summarize(known, "explain", *given.arguments(len(sources)), **same, out="why")
+    trained = () if recognizer.model.answers_by() == "gallery" else recognizer.gallery.trained
+    known = f"{model} recognizes {dataclasses.replace(recognizer.gallery, trained=trained).summary}"
+    frames_given = given.arguments(len(names) or len(results.failures))
+    results.summarize(known, "explain", *frames_given, segment=segment, **vars(arguments), out="why")
     if (segment or recording) and results.failures and all(results.failures):
         raise InputError(results.failures[0])
 
@@ -243,7 +245,7 @@ def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> No
     beside = console.width >= NOTE_WIDTH
     titles = "label", "name", "confidence", "classifier", "occluded", "points"
     table = Table(*["track"] * tracked, *titles, *["note"] * beside, folded=("name", "note"))
-    below = []
+    below: dict[str, list[str]] = {}
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
         overflow = [f"overflow: {r.overflow}"] * bool(r.overflow)
@@ -251,9 +253,10 @@ def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> No
         name = escape_characters(r.name or "unrecognized")
         row = str(r.label), name, confidence, r.classifier or "", "yes" if r.occluded else "no", str(r.points_used)
         table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row, *[note] * beside)
-        below += [f"{r.label}: {note}"] * (bool(note) and not beside)
+        if note and not beside:
+            below.setdefault(note, []).append(str(r.label))
     if frame is not None:
         console.print(f"{frame}:")
     console.print(table if recognitions else "no instances: all pixels are background")
-    for note in below:
-        console.print(note)
+    for note, labels in below.items():
+        console.print(f"{', '.join(labels)}: {note}")

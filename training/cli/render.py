@@ -9,6 +9,8 @@ import typer
 from training.cli import options
 from training.cli.app import app, finish, show_progress
 
+COPIES = 5
+
 
 @dataclasses.dataclass(frozen=True)
 class AugmentationOptions:
@@ -35,7 +37,7 @@ def render(
     azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,
     polar_step: Annotated[float, typer.Option(help="Degrees between cameras from pole to pole.")] = 5.0,
     kinds: AugmentationOptions,
-    copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 5,
+    copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = COPIES,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
     crops: Annotated[
         int | None,
@@ -57,6 +59,7 @@ def render(
     from training.views.dataset import render_crops, render_dataset
     from training.views.mesh_views import RenderJob
 
+    options.check_belongs("an augmentation", any(vars(kinds).values()), copies=None if copies == COPIES else copies)
     pool = processes.pool() or IN_PROCESS
     augmentations = Augmentations.of_names([name for name, on in vars(kinds).items() if on], copies) or None
     sources = scaled_meshes(find_meshes(meshes, names), mesh_scale)

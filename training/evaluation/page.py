@@ -15,7 +15,7 @@ from training.evaluation.scores import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_known_unknown, draw_reliability
 
-__all__ = ["accuracy_table", "answer_texts", "comparison", "marked", "write_report_page"]
+__all__ = ["accuracy_table", "answer_texts", "comparison", "marked", "upright", "write_report_page"]
 
 NO_VALUE = {"mean": None, "std": None}
 
@@ -42,6 +42,15 @@ def marked(table: Table, main: str) -> Table:
     """Return a table in which the column `main`, which has the answers of `thor2 recognize`, is marked."""
     header, rows = table
     return [_marked(title, main) for title in header], rows
+
+
+def upright(table: Table) -> Table:
+    """Return a table with instances and a column for each fusion; with one row for each, if there are fewer rows."""
+    header, rows = table
+    if len(rows) >= len(header) - 2:
+        return table
+    first, *others = map(list, zip(header, *rows, strict=True))
+    return first, others
 
 
 def accuracy_table(table: Mapping[str, Any], titles: Sequence[str]) -> Table:
@@ -157,7 +166,7 @@ def _accuracy_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
     for number, table in enumerate(report["accuracy"][report["rule"]]):
         heading = f"Accuracy by {' and '.join(table['by'])}" if table["by"] else "Accuracy without rejection"
         chart = _bar_chart(table, report["fusions"], heading, out / f"accuracy-{number - 1}.png")
-        every = marked(accuracy_table(table, report["fusions"]), report["main"])
+        every = upright(marked(accuracy_table(table, report["fusions"]), report["main"]))
         main = marked(accuracy_table(table, [report["main"]]), report["main"])
         sections.append(_with_fold(Section(heading, text, main), every, chart))
         text = ""

@@ -22,6 +22,7 @@ from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.networks.networks import EMBEDDING
+from thor2_jax.printable import first_names
 from thor2_jax.recognizer import DescribedFrame, Recognizer
 from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import BaselineInputs, baseline_file
@@ -159,7 +160,7 @@ def load_runs(paths: Sequence[Path], frames: Sequence[str] | None = None) -> Seq
             different = sorted(set(run.classes) ^ set(runs[0].classes))
             raise InputError(
                 f"model: {directories[0]} and {directory} have different classes "
-                f"({', '.join(different[:5]) or 'in another order'}); evaluate them separately"
+                f"({first_names(different) or 'in another order'}); evaluate them separately"
             )
         _check_same_descriptor(run, runs[0], directory, directories[0])
     return runs

@@ -16,12 +16,13 @@ import importlib
 import multiprocessing
 import os
 import signal
+import socket
 import warnings
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future
 from typing import Any, Protocol, TypeVar
 
-from thor2_jax.errors import InputError, needs_extra
+from thor2_jax.errors import InputError, needs_extra, reason_of
 from thor2_jax.processes import Processes
 
 __all__ = ["IN_PROCESS", "WorkerPool", "keep_freed_memory", "local_workers", "ray_workers"]
@@ -30,6 +31,9 @@ A = TypeVar("A")
 B = TypeVar("B")
 Handle = TypeVar("Handle")
 
+
+CONNECT_SECONDS = 10.0
+"""Longest time to connect to a Ray cluster."""
 
 ATTEMPTS = 3
 """Number of workers that may die at the same item before an error is raised."""
@@ -107,7 +111,7 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             duration of the map.
 
     Raises:
-        InputError: Ray is not installed. The map raises it if the address is not one of Ray.
+        InputError: Ray is not installed. The map raises it if no Ray cluster is at the address.
     """
     with needs_extra("engine is ray, which", "the package ray", "cluster"):
         ray: Any = importlib.import_module("ray")
@@ -119,6 +123,13 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             raise error.cause from None
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
+        host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+        if host and port.isdecimal():  # Ray would try for minutes to connect.
+            try:
+                socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
+            except (OSError, OverflowError, UnicodeError) as error:
+                reason = f"nothing answers at it ({reason_of(error)}); expected HOST:PORT of a Ray cluster; start it"
+                raise InputError(f"address is {address}; {reason}") from None
         with warnings.catch_warnings():
             # JAX warns about forks, but Ray's forks are safe, since they execute another program at once.
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)

@@ -16,7 +16,7 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view
 from thor2_jax.gallery.enrollment import augmented_view
-from thor2_jax.printable import check_name, normal_name
+from thor2_jax.printable import check_name, first_names, normal_name
 from thor2_jax.surfaces.surfaces import Surfaces
 from training.readers.frames import FrameFolder
 from training.views.crops import Crop, ViewCrops, rgbd_crop
@@ -106,8 +106,10 @@ def read_instances(
     if not views:
         if skipped:
             raise InputError(f"frames: {skipped[0][1]}")
-        wanted = "an object" if label_name is None else repr(label_name)
-        raise InputError(f"frames: no frame has a label for {wanted}; see labels.json, or give --instance")
+        if label_name is None:
+            raise InputError("frames: no frame has a label; expected the names of the objects in labels.json")
+        names = first_names(sorted(frames.names() or ())) or "none"
+        raise InputError(f"frames: no frame has a label {label_name!r}, but {names}; give --label-name or --instance")
     return LabelledInstances(views, [reason for _, reason in skipped], None if crop_size is None else crops)
 
 

@@ -50,19 +50,19 @@ def test_describe_with_jax_enable_x64() -> None:
 def test_arguments_of_other_types_are_named() -> None:
     packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
     one, batches = jax.tree.map(lambda a: a[0], packed), jax.tree.map(lambda a: a[None], packed)
-    exchanged = "network is a DescriptorConfig; expected a ColorNetwork"
+    exchanged = "network is of type DescriptorConfig; expected a ColorNetwork"
     for function in (thor2.describe, thor2.describe_aligned, thor2.strips, describe.describe_sharded):
         assert_refused("clouds is ndarray", function, np.zeros((1, 5, 3)), NETWORK, CLOSED)
         assert_refused(r"points \[512, 3\]", function, one, NETWORK, CLOSED)
         assert_refused(r"points \[1, 1, 512, 3\]", function, batches, NETWORK, CLOSED)
         assert_refused(exchanged, function, packed, CLOSED, NETWORK)
-        assert_refused("config is a NoneType; expected a DescriptorConfig", function, packed, NETWORK, None)
+        assert_refused("config is of type NoneType; expected a DescriptorConfig", function, packed, NETWORK, None)
     for without_network in (thor2.align, thor2.view_normalize, thor2.turn, thor2.diagrams):
         assert_refused("clouds is list", without_network, [], CLOSED)
-        assert_refused("config is a ColorNetwork", without_network, packed, NETWORK)
+        assert_refused("config is of type ColorNetwork", without_network, packed, NETWORK)
     assert_refused("clouds is list", thor2.mirror, [], "x")
-    assert_refused("strips is a PointClouds; expected a Strips", thor2.describe_strips, packed, NETWORK, CLOSED)
-    assert_refused("parameters is a dict; expected a Parameters", thor2.describe, packed, NETWORK, CLOSED, {})
+    assert_refused("strips is of type PointClouds; expected a Strips", thor2.describe_strips, packed, NETWORK, CLOSED)
+    assert_refused("parameters is of type dict; expected a Parameters", thor2.describe, packed, NETWORK, CLOSED, {})
     assert_refused(exchanged, thor2.Parameters.of, CLOSED, NETWORK)
 
 

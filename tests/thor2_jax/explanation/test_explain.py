@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -339,6 +340,11 @@ def test_texts_of_pictures_are_inside(explanation: Explanation) -> None:
         pixels = np.asarray(Image.open(io.BytesIO(png_bytes(picture.figure))))
         assert all((border == 255).all() for border in (pixels[:2], pixels[:, :2])), picture.title
     narrow = dataclasses.replace(instance, points=instance.points[:, [1, 0, 2]])
+    thin = dataclasses.replace(narrow, points=narrow.points * [0.4, 1, 1])
+    figure = pictures._decided_cloud(dataclasses.replace(explanation, instance=thin)).figure
+    figure.draw_without_rendering()
+    numbers = [label.get_window_extent() for label in figure.axes[0].get_xticklabels()]
+    assert all(one.x1 < other.x0 for one, other in itertools.pairwise(numbers))
     figure = pictures._clouds([("052_extra_large_clamp" * 2, narrow)] * 3)
     figure.draw_without_rendering()
     first, second, third = (axes.title.get_window_extent() for axes in figure.axes[:3])

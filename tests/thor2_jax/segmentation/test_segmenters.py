@@ -39,7 +39,7 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
 def test_the_table_segmenter_is_built_in() -> None:
     assert segmenter_names()[0] == "table" and load_segmenter("table") is segment_table
     np.testing.assert_array_equal(thor2.segment(FRAME), segment_table(FRAME))
-    assert_refused("^frame is a str; expected an RGBDFrame", thor2.segmented, "frame.png")
+    assert_refused("^frame is of type str; expected an RGBDFrame", thor2.segmented, "frame.png")
 
 
 def test_a_segmenter_of_another_package(offer: Callable[[str, str], None]) -> None:
@@ -80,5 +80,5 @@ def test_segmenters_that_fail() -> None:
     def failing(frame: RGBDFrame) -> np.ndarray[Any, Any]:
         raise NotImplementedError  # without a message
 
-    assert_refused("^frame is a str", segment, FRAME, lambda frame: segment_table(segment("frame")))
+    assert_refused("^frame is of type str", segment, FRAME, lambda frame: segment_table(segment("frame")))
     assert_refused(r"^segmenter failing failed .*\(NotImplementedError\);", segment, FRAME, failing)

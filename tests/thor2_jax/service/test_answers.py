@@ -106,7 +106,7 @@ def test_model_and_color_network(server: Any, http: httpx.Client) -> None:
     model = Client(server.url, timeout=HANG).model()
     assert model.classes == CLASSES and set(model.classifiers) == {"ce", "tops", "tops2"}
     assert model.config.n_slices == 7 and model.color_network == NETWORK.fingerprint
-    assert model.knows == f"{len(CLASSES)} objects: {', '.join(CLASSES[:6])}, ..."
+    assert model.knows == f"{len(CLASSES)} objects: {', '.join(CLASSES[:5])}, ..., {CLASSES[-1]}"
     assert "local/path" not in str(model)
     answer = http.get("/v1/colornet").json()
     np.testing.assert_allclose(answer["mean_rgb"], NETWORK.mean_rgb)
@@ -157,6 +157,8 @@ def test_no_answer_and_arguments_that_the_client_refuses() -> None:
         url = f"http://127.0.0.1:{listening.getsockname()[1]}"
         with pytest.raises(TimeoutError, match="127.0.0.1"):
             Client(url, timeout=0.01).model()
+        with pytest.raises(TimeoutError, match=r"\(\w+\)$"):
+            asyncio.run(AsyncClient(url, timeout=0.01).model())
     with pytest.raises(ConnectionError, match="127.0.0.1"):
         asyncio.run(AsyncClient(url).model())
     for wrong in ("127.0.0.1:8080", "http://", "ftp://a", "http://[", ""):

@@ -24,7 +24,8 @@ from small_runs import save_untrained_run
 from typer.main import get_command
 
 import thor2_jax as thor2
-from training.cli.app import app, enable_compilation_cache, finish, show_progress
+from training.cli.app import app, console, enable_compilation_cache, finish, show_progress
+from training.cli.evaluate import _print_columns
 from training.cli.options import FrameOptions
 from training.storage.jobs import cache_directory, numbered
 
@@ -56,6 +57,7 @@ def test_a_usage_error_is_one_line(refused: Command) -> None:
         ("objects --model=~/m=", f"{Path.home()}/m= is not a run directory"),
         ("train --dataset m --out o --frames", "'--frames' requires an argument"),
         ("render --meshes m --out o --sensor --copies 100000000000000000000", "copies is 100000000000000000000;"),
+        ("render --meshes m --out o --copies 3", "copies is 3; it belongs to an augmentation"),
         ("render --meshes m --out o --sensor --crops 99999999", "(given: 99999999)"),
     ):
         assert expected in refused(*shlex.split(command))
@@ -84,6 +86,9 @@ def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]
     same = ["a b", "./-c", "--depth-scale", "100.0", "--max-gap", "0.5"]
     assert shlex.split(line)[-9:] == [*same, "--unknown-below", "0.0", "--extend"]
     assert FrameOptions(frames=[Path("a")] * 4).arguments() == ["FRAME"] and given.arguments(4)[0] == "FRAME"
+    recording = FrameOptions(bag=Path("a.mcap"), every=2)
+    for n_frames, every in ((3, "2"), (300, "600")):
+        assert recording.arguments(n_frames) == ["--bag", "a.mcap", "--every", every]
 
 
 def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:
@@ -112,6 +117,20 @@ def test_a_narrow_terminal_cuts_no_column(monkeypatch: pytest.MonkeyPatch) -> No
     width, *table = run_python("-c", code).stdout.splitlines()
     assert width == "72" and "".join(table).count("TOPS") == 2 and "…" not in "".join(table)
     assert "".join(table).count("x") == 99 and "120" in "".join(table)
+
+
+def test_wide_tables_are_split(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, "_width", 80)
+    rows = [["all", *(f"0.{n} ± 0.012" for n in range(700, 712))], ["by light", *[""] * 12]]
+    _print_columns(["", *(f"method-{n} (thor2 recognize)" for n in range(12))], rows, "accuracy")
+    out = capsys.readouterr().out
+    assert all(value in out for value in rows[0]) and out.count("by light") == out.count("accuracy") == 3
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_text_is_not_broken_into_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    console.print("word " * 99)
+    assert capsys.readouterr().out.count("\n") == 1
 
 
 def test_objects_without_jax_or_all_characters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,14 +101,17 @@ def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path, pri
     for other, count in ((), 2), ((write_frame(frames / "002", {1: "brick"}, 2),), 3):
         generation = Recognizer.load(model).gallery.generation
         line = "skipped: views of brick that are repeated or enrolled already: 1\n"
-        assert line in printed("enroll", "brick", *more, *other, "--extend")
+        text = printed("enroll", "brick", *more, *other, "--extend")
+        assert line in text and "new, since" not in text
         assert view_counts(model) == {"brick": count, "book": 2, "red thing": 1}
         assert (Recognizer.load(model).gallery.generation > generation) == bool(other)
     assert run_thor2("enroll", "brick", *more, "--replace") == 0
     assert view_counts(model)["brick"] == 1
+    text = printed("enroll", "brik", *more, "--label-name", "brick", "--extend")
+    assert "new, since no object with this name can be extended: brik\n" in text
 
 
-def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
+def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command, printed: Command) -> None:
     """They have the object as their only instance, or --instance names it; so do the segments of a recording."""
     for folder in ("000", "001"):
         (frames / folder / "labels.json").unlink()
@@ -118,7 +121,8 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
     (write_frame(tmp_path / "one", {3: "leaf"}) / "labels.json").unlink()
     assert run_thor2("enroll", "only", *frame_options(tmp_path / "one"), "--model", model) == 0
     bag = write_recording(tmp_path / "a.mcap", [table_frame(0), table_frame(3)])
-    assert run_thor2("enroll", "box", "--bag", bag, "--instance", 1, "--model", model) == 0
+    text = printed("enroll", "box", "--bag", bag, "--instance", 1, "--model", model)
+    assert "warning: 1 may be another object in each frame" in text
     assert view_counts(model) == {"brick": 2, "book": 2, "new": 2, "only": 1, "box": 2}
 
 
@@ -174,6 +178,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--mesh", tmp_path / "one.ply", "--mesh-scale", 1000), "instance by --mesh-scale 1"),
         (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "--extend and --replace are given"),
         (("--frames", frames, "--instance", 1), "name is missing"),
+        (("--bag", frames), "name is missing"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
         (("mug", "--mesh", tmp_path / "one.ply", "--segment", "table"), "segment is table; it belongs to frames"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
@@ -233,7 +238,7 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
         (("new", "--mesh", large), "mm.ply"),
         (("--frames", tiny), "points"),
         (("new", *one_frame(tiny, 1)), "points"),
-        (("new", "--frames", frames), "'new'"),
+        (("new", "--frames", frames), "'new', but book, brick; give --label-name or --instance"),
         (("new", *frame_options(frames / "000")), "--instance"),
         (("new", *one_frame(frames / "000", 4)), "instance is 4"),
         (("new", *frame_options(tiny, labels=tiny / "color.png")), "error: color: --labels: "),

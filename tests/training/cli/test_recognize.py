@@ -12,7 +12,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from commands import Command, Recognize, Texts, frame_options, json_lines, run_thor2
-from image_files import frame_of_squares, small_frame, write_frame_files
+from image_files import frame_of_squares, small_frame, write_frame, write_frame_files
 from PIL import Image
 from recording_files import COLOR, DEPTH, PERIOD, START, bag_writer, image, table_frame, write_images, write_recording
 from rosbags.highlevel import AnyReader
@@ -106,14 +106,25 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts, m
 def test_a_narrow_terminal_cuts_no_name(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Names may look like markup, mathtext or terminal commands, and have any characters."""
     monkeypatch.setattr(recognize_command.console, "_width", 80)
-    answers = [Recognition(2, reason="unknown: a confidence of 0.448, below 0.573", confidence=0.448)]
+    answers = [Recognition(n, reason="unknown: a confidence of 0.448, below 0.573", confidence=0.448) for n in (2, 5)]
     names = ("021_bleach_cleanser", "$\\frac{", "[red]mug[/x]", "茶碗\u202e\x1b[2J")
     recognize_command._print_table("f", answers + [Recognition(1, name, 0.954, "embedding") for name in names])
     out = capfd.readouterr().out
     assert all(text in out for text in (*names[:3], r"茶碗\u202e\x1b[2J", "unrecognized", "0.954")) and "…" not in out
     assert "\x1b" not in out and "\u202e" not in out
     assert "┃ confidence ┃ classifier ┃ occluded ┃ points ┃" in out and max(map(len, out.splitlines())) == 77
-    assert "\n2: unknown: a confidence of 0.448, below 0.573\n" in out
+    assert "\n2, 5: unknown: a confidence of 0.448, below 0.573\n" in out
+    recognize_command._print_table("f", [Recognition(1, "070-b_colored_wood_blocks", 0.954, "embedding")])
+    assert "│070-b_colored_wood_blocks│" in capfd.readouterr().out
+
+
+@pytest.mark.usefixtures("small_embedding")
+def test_answers_by_the_gallery_count_its_objects(model: Path, tmp_path: Path, printed: Command) -> None:
+    run, frame = shutil.copytree(model, tmp_path / "run"), write_frame(tmp_path / "a", {1: "leaf"})
+    assert run_thor2("enroll", "--frames", frame, "--model", run) == 0
+    command = ("recognize", frame, "--model", run, "--unknown-below", 1)
+    assert "recognizes 1 object: leaf\n" in printed(*command, "--answer-by", "gallery")
+    assert "recognizes 4 objects" in printed(*command)
 
 
 def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:

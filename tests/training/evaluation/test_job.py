@@ -21,6 +21,7 @@ from thor2_jax.files import LOCK, locked
 from thor2_jax.frames.overlay import Annotation
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import answer_frames, evaluate_dataset
+from training.evaluation.page import upright
 from training.evaluation.runs import Run
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame, LabelledFrames
@@ -152,6 +153,14 @@ def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
         with Image.open(directory / str(picture["src"])) as image:
             image.load()
             assert max(image.size) <= 2000
+
+
+def test_a_table_with_few_rows_is_upright() -> None:
+    assert upright((["", "n", "a", "b"], [["all", "9", ".1", ".2"]])) == (
+        ["", "all"], [["n", "9"], ["a", ".1"], ["b", ".2"]],
+    )  # fmt: skip
+    table = ["", "n", "a"], [["all", "9", ".1"]]
+    assert upright(table) is table
 
 
 def test_a_dataset_whose_only_object_has_no_pixels(tmp_path: Path) -> None:
