@@ -109,7 +109,7 @@ def read_instances(
         if label_name is None:
             raise InputError("frames: no frame has a label; expected the names of the objects in labels.json")
         names = first_names(sorted(frames.names() or ())) or "none"
-        raise InputError(f"frames: no frame has a label {label_name!r}, but {names}; give --label-name or --instance")
+        raise InputError(f"frames: no label is {label_name!r}; expected {names}: give --label-name or --instance")
     return LabelledInstances(views, [reason for _, reason in skipped], None if crop_size is None else crops)
 
 

@@ -238,7 +238,7 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
         (("new", "--mesh", large), "mm.ply"),
         (("--frames", tiny), "points"),
         (("new", *one_frame(tiny, 1)), "points"),
-        (("new", "--frames", frames), "'new', but book, brick; give --label-name or --instance"),
+        (("new", "--frames", frames), "'new'; expected book, brick: give --label-name"),
         (("new", *frame_options(frames / "000")), "--instance"),
         (("new", *one_frame(frames / "000", 4)), "instance is 4"),
         (("new", *frame_options(tiny, labels=tiny / "color.png")), "error: color: --labels: "),
