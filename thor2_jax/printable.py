@@ -49,7 +49,7 @@ def find_name(name: str, known: Collection[str]) -> str | None:
 
 
 def first_names(names: Sequence[str], most: int = 6) -> str:
-    """Return at most `most` names as a list in a sentence: the first ones, with dots for further ones, and the last."""
+    """Return names as a list in a sentence; of more than `most`, the first ones, dots and the last one."""
     return ", ".join(names if len(names) <= most else [*names[: most - 1], "...", names[-1]])
 
 

@@ -102,7 +102,7 @@ def enroll_objects(
             names, kind = list(source), "mesh"
         names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in names]
         if extend and (new_names := [each for each in names if each not in objects.gallery.answered_names]):
-            notes.append(f"new, since no object with this name can be extended: {first_names(new_names)}")
+            notes.append(f"enrolled as new, since the model has no object with this name: {first_names(new_names)}")
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)  # before its views are rendered
             given, surface = next(views), next(surfaces)

@@ -159,7 +159,7 @@ def _is_complete(job: TrainJob, labelled: LabelledInstances | None) -> bool:
     }
     requested = {
         "seed": job.protocol.fit.seed,
-        "leave_out": sorted(set(job.leave_out)),  # before the objects of the dataset, which depend on it
+        "leave_out": sorted(set(job.leave_out)),  # compared before the dataset, whose objects depend on it
         "dataset": job.protocol.render_job(_kept_meshes(job)).record(),
         "frames": labelled.digest if labelled else None,
     }

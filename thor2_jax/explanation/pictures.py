@@ -124,7 +124,7 @@ def _decided_cloud(explanation: Explanation) -> ExplanationPicture:
     figure, axes = _figure()
     instance = explanation.instance
     plot.cloud(axes, instance.points, instance.colors, explanation.attributions.values, size=_point_size(instance))
-    axes.set_adjustable("datalim")  # The numbers below a narrow cloud would overlap.
+    axes.set_adjustable("datalim")  # The axes of a narrow cloud would be narrow, and their numbers overlap.
     _color_bar(figure, axes, explanation)
     caption = f"The {len(instance.points)} points of the object as the camera sees them, in the same colours."
     return ExplanationPicture("cloud", "decided", "What decided, on the points", caption, figure)

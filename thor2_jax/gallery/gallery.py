@@ -320,7 +320,7 @@ class Gallery:
 
     @functools.cached_property
     def summary(self) -> str:
-        """The names as a phrase, such as "21 objects: mug, bowl, ..."."""
+        """The names as a phrase, such as "21 objects: mug, bowl, ..., cup"."""
         toys = [name for name in self.answered_names if name in TOYS] if set(self.trained) == TOYS else []
         own = [name for name in self.answered_names if name not in toys]
         listed = first_names(own)

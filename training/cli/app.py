@@ -134,8 +134,8 @@ class _Console(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:
         shown = [escape_characters(each) if isinstance(each, str) else each for each in objects]
-        is_read = not self.is_terminal and all(isinstance(each, str) for each in objects)
-        super().print(*shown, **{"soft_wrap": is_read} | options)
+        is_piped_text = not self.file.isatty() and all(isinstance(each, str) for each in objects)
+        super().print(*shown, **{"soft_wrap": is_piped_text} | options)
 
 
 # Without a terminal, rich would truncate tables at 80 columns. Below 72, it would leave out columns of tables, so
@@ -145,7 +145,7 @@ console = _Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):
-    """A table that folds words where rich cuts them, and has no padding if it fits only without."""
+    """A table that folds words instead of cutting them, and has no padding if words fit only without it."""
 
     def __init__(self, *titles: str, title: str | None = None, folded: Collection[str] | None = None) -> None:
         """Create the table; the columns that are not in `folded` keep their width. By default, all may be folded."""
@@ -153,7 +153,7 @@ class Table(table.Table):
         super().__init__(*(table.Column(each, overflow="fold", no_wrap=each in fixed) for each in titles), title=title)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        excess = self.__rich_measure__(console, options.update(max_width=10_000)).maximum - options.max_width
+        excess = self.__rich_measure__(console, options.update(max_width=10_000)).minimum - options.max_width
         if 0 < excess <= 2 * len(self.columns):
             self.padding = 0
         return super().__rich_console__(console, options)

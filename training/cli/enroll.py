@@ -58,10 +58,10 @@ def enroll(
     has_frames = bool(given.arguments())
     if bool(mesh) == has_frames:
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
+    options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance, segment=segment)
     if name is None and any(each is not None for each in (target.label_name, target.instance, given.bag, segment)):
         raise InputError("name is missing; --label-name, --instance, --bag and --segment enroll one object")
     options.check_alone("replace", target.replace, extend=target.extend)
-    options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance, segment=segment)
     scale = options.given_values(target).get("mesh_scale")
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
     from training.objects.meshes import find_object_meshes
@@ -79,7 +79,10 @@ def enroll(
     for note in notes:
         console.print(note)
     if target.instance is not None and len(frames) > 1 and (given.bag or segment):
-        console.print(f"warning: {target.instance} may be another object in each frame, since they are segmented apart")
+        console.print(
+            f"warning: instance {target.instance} may be a different object in each frame, since each is segmented "
+            "separately; check it with thor2 recognize, or enroll one frame at a time"
+        )
     for each, count in counts.items():
         console.print(f"views of {each}: {count}")
     if known.weak_rejection:

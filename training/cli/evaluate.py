@@ -178,7 +178,8 @@ def _print_columns(header: Sequence[str], rows: Sequence[Sequence[str]], title: 
         end = start + 1
         while end < len(columns) and 1 + widths[0] + sum(widths[start : end + 1]) <= console.width:
             end += 1
-        shown = Table(header[0], *header[start:end], title=title, folded=header[start:end])
+        fits = 1 + widths[0] + widths[start] <= console.width
+        shown = Table(header[0], *header[start:end], title=title, folded=header[start:end] if fits else None)
         for row in rows:
             if not row[1]:
                 shown.add_section()

@@ -140,9 +140,9 @@ class FrameOptions:
     every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take every N-th frame.")] = 1
 
     def arguments(self, n_frames: int = 0) -> list[str]:
-        """Return the arguments that pass the same frames to another command, but not more than three of them.
+        """Return the arguments that pass the same frames to another command, if there are at most three.
 
-        FRAME stands for more folders, and only the first frame of a longer recording is passed.
+        Otherwise, FRAME stands for the folders, and of a recording only the first frame is passed.
 
         Args:
             n_frames: number of frames in the given folders or the recording, if it is known.

@@ -8,7 +8,7 @@ import json
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -141,6 +141,11 @@ class _Answers:
         paths = given.out, given.out_bag, given.coco, given.bop, given.rerun
         return ", ".join(str(path) for path in paths if path and path.exists())
 
+    @property
+    def n_frames(self) -> int:
+        """Number of frames so far, with those that could not be recognized."""
+        return len(self.failures) + len(self._failed)
+
     def summarize(self, known: str, *command: str, **options: object) -> None:
         """Print where the answers are, `known` if an object is unknown, and the next command; refuse failed frames."""
         notes = sys.stderr if self._as_json else None
@@ -151,8 +156,8 @@ class _Answers:
         if self._tables.n_without_number:
             print_note(f"instances whose name has no number in {self._given.names}: {self._tables.n_without_number}")
         if self._failed:
-            total, listed = len(self._failed) + len(self.failures), first_names(self._failed)
-            raise InputError(f"{len(self._failed)} of {total} frames could not be recognized: {listed}; see above")
+            failed = f"{len(self._failed)} of {self.n_frames} frames could not be recognized"
+            raise InputError(f"{failed}: {first_names(self._failed)}; see above")
 
 
 @app.command()
@@ -228,10 +233,11 @@ def recognize(
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
-    trained = () if recognizer.model.answers_by() == "gallery" else recognizer.gallery.trained
-    known = f"{model} recognizes {dataclasses.replace(recognizer.gallery, trained=trained).summary}"
-    frames_given = given.arguments(len(names) or len(results.failures))
-    results.summarize(known, "explain", *frames_given, segment=segment, **vars(arguments), out="why")
+    unused: dict[str | None, Any] = {"gallery": {"trained": ()}, "classifiers": {"objects": {}}}
+    answering = dataclasses.replace(recognizer.gallery, **unused.get(recognizer.model.answers_by(), {}))
+    frames_given = given.arguments(len(names) or results.n_frames)
+    same = {"segment": segment, **vars(arguments)}
+    results.summarize(f"{model} recognizes {answering.summary}", "explain", *frames_given, **same, out="why")
     if (segment or recording) and results.failures and all(results.failures):
         raise InputError(results.failures[0])
 

@@ -59,7 +59,8 @@ def render(
     from training.views.dataset import render_crops, render_dataset
     from training.views.mesh_views import RenderJob
 
-    options.check_belongs("an augmentation", any(vars(kinds).values()), copies=None if copies == COPIES else copies)
+    given_copies = None if copies == COPIES else copies
+    options.check_belongs("an augmentation, such as --sensor", any(vars(kinds).values()), copies=given_copies)
     pool = processes.pool() or IN_PROCESS
     augmentations = Augmentations.of_names([name for name, on in vars(kinds).items() if on], copies) or None
     sources = scaled_meshes(find_meshes(meshes, names), mesh_scale)

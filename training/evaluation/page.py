@@ -45,12 +45,13 @@ def marked(table: Table, main: str) -> Table:
 
 
 def upright(table: Table) -> Table:
-    """Return a table with instances and a column for each fusion; with one row for each, if there are fewer rows."""
+    """Return an accuracy table, transposed to one row for each fusion if it has fewer rows than fusions."""
     header, rows = table
-    if len(rows) >= len(header) - 2:
+    n_fusions = len(header) - 2
+    if len(rows) >= n_fusions:
         return table
     first, *others = map(list, zip(header, *rows, strict=True))
-    return first, others
+    return ["", *first[1:]], others
 
 
 def accuracy_table(table: Mapping[str, Any], titles: Sequence[str]) -> Table:
@@ -192,12 +193,12 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
             f"sign marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
         )
     elif EMBEDDING in report["fusions"]:
-        text += f"The column {EMBEDDING} shows the answers of the embedding, which uses shape and colour. "
+        text += f"{EMBEDDING} shows the answers of the embedding, which uses shape and colour. "
     if ALL_CLASSIFIERS in report["fusions"]:
         named_by = main_fusion(title for title in report["fusions"] if title != ALL_CLASSIFIERS)
         names = f"the names from {named_by} with" if named_by != EMBEDDING else "these names with"
         text += (
-            f"The column {ALL_CLASSIFIERS} shows {names} the confidence from the embedding; answers below the "
+            f"{ALL_CLASSIFIERS} shows {names} the confidence from the embedding; answers below the "
             "threshold keep their names in this table. "
         )
     if not set(report["fusions"]).isdisjoint(TITLES.values()):

@@ -33,7 +33,7 @@ Handle = TypeVar("Handle")
 
 
 CONNECT_SECONDS = 10.0
-"""Longest time to connect to a Ray cluster."""
+"""Longest time to connect to one network address of a Ray cluster."""
 
 ATTEMPTS = 3
 """Number of workers that may die at the same item before an error is raised."""
@@ -111,7 +111,7 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             duration of the map.
 
     Raises:
-        InputError: Ray is not installed. The map raises it if no Ray cluster is at the address.
+        InputError: Ray is not installed. The map raises it if the address is invalid or cannot be reached.
     """
     with needs_extra("engine is ray, which", "the package ray", "cluster"):
         ray: Any = importlib.import_module("ray")
@@ -123,13 +123,16 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             raise error.cause from None
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
-        host, _, port = (address or "").removeprefix("ray://").rpartition(":")
-        if host and port.isdecimal():  # Ray would try for minutes to connect.
+        given = address or os.environ.get("RAY_ADDRESS", "")
+        host, _, port = given.removeprefix("ray://").rpartition(":")
+        if host and "/" not in host and port.isdecimal():  # Ray would try for minutes to connect.
             try:
                 socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
             except (OSError, OverflowError, UnicodeError) as error:
-                reason = f"nothing answers at it ({reason_of(error)}); expected HOST:PORT of a Ray cluster; start it"
-                raise InputError(f"address is {address}; {reason}") from None
+                raise InputError(
+                    f"address is {given}, which cannot be reached ({reason_of(error)}); expected HOST:PORT of a Ray "
+                    "cluster; start the cluster, or correct the address"
+                ) from None
         with warnings.catch_warnings():
             # JAX warns about forks, but Ray's forks are safe, since they execute another program at once.
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)

@@ -108,8 +108,8 @@ def read_instances(
             raise InputError(f"frames: {skipped[0][1]}")
         if label_name is None:
             raise InputError("frames: no frame has a label; expected the names of the objects in labels.json")
-        names = first_names(sorted(frames.names() or ())) or "none"
-        raise InputError(f"frames: no label is {label_name!r}; expected {names}: give --label-name or --instance")
+        names = first_names(sorted(frames.names() or ())) or "the names in labels.json, which has none"
+        raise InputError(f"frames: no label is {label_name!r}; expected one of {names}; see --label-name, --instance")
     return LabelledInstances(views, [reason for _, reason in skipped], None if crop_size is None else crops)
 
 

@@ -126,6 +126,8 @@ def test_wide_tables_are_split(capsys: pytest.CaptureFixture[str], monkeypatch: 
     out = capsys.readouterr().out
     assert all(value in out for value in rows[0]) and out.count("by light") == out.count("accuracy") == 3
     assert max(map(len, out.splitlines())) <= 80
+    _print_columns(["", "method"], [["x" * 97, "0.712"]], "accuracy")
+    assert "0.712" in capsys.readouterr().out
 
 
 def test_text_is_not_broken_into_lines(capsys: pytest.CaptureFixture[str]) -> None:

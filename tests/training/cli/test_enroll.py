@@ -102,13 +102,13 @@ def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path, pri
         generation = Recognizer.load(model).gallery.generation
         line = "skipped: views of brick that are repeated or enrolled already: 1\n"
         text = printed("enroll", "brick", *more, *other, "--extend")
-        assert line in text and "new, since" not in text
+        assert line in text and "enrolled as new" not in text
         assert view_counts(model) == {"brick": count, "book": 2, "red thing": 1}
         assert (Recognizer.load(model).gallery.generation > generation) == bool(other)
     assert run_thor2("enroll", "brick", *more, "--replace") == 0
     assert view_counts(model)["brick"] == 1
     text = printed("enroll", "brik", *more, "--label-name", "brick", "--extend")
-    assert "new, since no object with this name can be extended: brik\n" in text
+    assert "enrolled as new, since the model has no object with this name: brik\n" in text
 
 
 def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command, printed: Command) -> None:
@@ -122,7 +122,7 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
     assert run_thor2("enroll", "only", *frame_options(tmp_path / "one"), "--model", model) == 0
     bag = write_recording(tmp_path / "a.mcap", [table_frame(0), table_frame(3)])
     text = printed("enroll", "box", "--bag", bag, "--instance", 1, "--model", model)
-    assert "warning: 1 may be another object in each frame" in text
+    assert "warning: instance 1 may be a different object in each frame" in text
     assert view_counts(model) == {"brick": 2, "book": 2, "new": 2, "only": 1, "box": 2}
 
 
@@ -238,7 +238,7 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
         (("new", "--mesh", large), "mm.ply"),
         (("--frames", tiny), "points"),
         (("new", *one_frame(tiny, 1)), "points"),
-        (("new", "--frames", frames), "'new'; expected book, brick: give --label-name"),
+        (("new", "--frames", frames), "'new'; expected one of book, brick; see --label-name"),
         (("new", *frame_options(frames / "000")), "--instance"),
         (("new", *one_frame(frames / "000", 4)), "instance is 4"),
         (("new", *frame_options(tiny, labels=tiny / "color.png")), "error: color: --labels: "),
