@@ -61,12 +61,12 @@ def test_main_fusion_is_that_of_what_answers() -> None:
 @pytest.mark.parametrize(
     ("columns", "shown"),
     [
-        ((EMBEDDING,), "column embedding shows the answers"),
-        (("tops", EMBEDDING, "classifiers"), "column classifiers shows the names from TOPS with"),
-        (("ce", EMBEDDING, "classifiers"), "column classifiers shows these names with"),
+        ((EMBEDDING,), "embedding shows the answers"),
+        (("tops", EMBEDDING, "classifiers"), "classifiers shows the names from TOPS with"),
+        (("ce", EMBEDDING, "classifiers"), "classifiers shows these names with"),
     ],
 )
-def test_the_page_says_which_column_gives_the_names(columns: tuple[str, ...], shown: str) -> None:
+def test_the_page_says_which_fusion_gives_the_names(columns: tuple[str, ...], shown: str) -> None:
     text = _accuracy_text({"fusions": list(fusions(columns)), "rule": "log-mean", "scratch": [], "runs": ["run"]})
     assert shown in text and "THOR2" not in text
 
