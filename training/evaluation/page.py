@@ -193,12 +193,12 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
             f"sign marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
         )
     elif EMBEDDING in report["fusions"]:
-        text += f"{EMBEDDING} shows the answers of the embedding, which uses shape and colour. "
+        text += f"The entry {EMBEDDING} shows the answers of the embedding, which uses shape and colour. "
     if ALL_CLASSIFIERS in report["fusions"]:
         named_by = main_fusion(title for title in report["fusions"] if title != ALL_CLASSIFIERS)
         names = f"the names from {named_by} with" if named_by != EMBEDDING else "these names with"
         text += (
-            f"{ALL_CLASSIFIERS} shows {names} the confidence from the embedding; answers below the "
+            f"The entry {ALL_CLASSIFIERS} shows {names} the confidence from the embedding; answers below the "
             "threshold keep their names in this table. "
         )
     if not set(report["fusions"]).isdisjoint(TITLES.values()):

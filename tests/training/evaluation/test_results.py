@@ -61,9 +61,9 @@ def test_main_fusion_is_that_of_what_answers() -> None:
 @pytest.mark.parametrize(
     ("columns", "shown"),
     [
-        ((EMBEDDING,), "embedding shows the answers"),
-        (("tops", EMBEDDING, "classifiers"), "classifiers shows the names from TOPS with"),
-        (("ce", EMBEDDING, "classifiers"), "classifiers shows these names with"),
+        ((EMBEDDING,), "entry embedding shows the answers"),
+        (("tops", EMBEDDING, "classifiers"), "entry classifiers shows the names from TOPS with"),
+        (("ce", EMBEDDING, "classifiers"), "entry classifiers shows these names with"),
     ],
 )
 def test_the_page_says_which_fusion_gives_the_names(columns: tuple[str, ...], shown: str) -> None:
