@@ -1,4 +1,4 @@
-"""The tracker, which matches the instances of successive frames in space and fuses the answers for each object.
+"""The tracker, which follows the objects of successive frames and fuses the answers for each object.
 
 >>> tracker = recognizer.track()                                                    # doctest: +SKIP
 >>> for frame in frames:                                                            # doctest: +SKIP
@@ -6,11 +6,6 @@
 ...         print(answer.track, answer.name, answer.confidence)
 >>> [(track.track, track.name, track.frames) for track in tracker.tracks()]        # doctest: +SKIP
 [(1, 'mug', 5), (2, 'bowl', 4)]
-
-Clouds of two frames are matched so that their overlap is largest. The overlap is the number of voxels that both clouds
-occupy, divided by the geometric mean of their numbers of voxels, averaged over the voxel sizes `VOXELS`. An object that
-is largely occluded is still matched; a small object near the place of a large one is not. Small voxels distinguish
-neighbouring objects; large voxels allow for motion between the frames.
 
 The log-probabilities of each classifier and the scores of the gallery are averaged, with the weights of the views.
 Successive frames are nearly the same, so their probabilities are not multiplied like those of independent observations:
@@ -34,6 +29,7 @@ from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, object_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
+from thor2_jax.tracking.matching import match, moved
 from thor2_jax.tracking.viewpoints import (
     NextView,
     PosedInstance,
@@ -45,48 +41,6 @@ from thor2_jax.tracking.viewpoints import (
 )
 
 __all__ = ["FusedEvidence", "TrackedRecognition", "Tracker", "view_weight"]
-
-VOXELS = (0.01, 0.02, 0.04)
-"""Voxel sides, metres."""
-
-MIN_OVERLAP = 0.25
-"""Smallest overlap of two clouds of one object. With 0.2, twice as many objects continue the track of another one."""
-
-_AXIS = 2**21
-"""Number of voxels along each axis that have distinct numbers."""
-
-OccupiedVoxels = tuple[NDArray[np.int64], ...]
-"""Numbers of the voxels that a cloud occupies, in increasing order, for each of `VOXELS`."""
-
-
-def occupied_voxels(points: NDArray[np.floating]) -> OccupiedVoxels:
-    """Return the voxels that points [n, 3] in metres occupy, for each of `VOXELS`."""
-    numbers = []
-    for size in VOXELS:
-        x, y, z = np.floor(points / size).astype(np.int64).T
-        numbers.append(np.unique((x * _AXIS + y) * _AXIS + z))
-    return tuple(numbers)
-
-
-def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
-    """Return the overlap of two clouds that are not empty, from 0 to 1."""
-    pairs = zip(first, second, strict=True)
-    shares = [len(np.intersect1d(a, b, assume_unique=True)) / np.sqrt(len(a) * len(b)) for a, b in pairs]
-    return float(np.mean(shares))
-
-
-def match(first: Sequence[OccupiedVoxels], second: Sequence[OccupiedVoxels]) -> list[tuple[int, int]]:
-    """Return pairs of indices into both sequences with the largest total overlap; each index occurs at most once.
-
-    Pairs with an overlap below `MIN_OVERLAP` are left out.
-    """
-    from scipy.optimize import linear_sum_assignment  # takes 0.1 s to import, and one frame needs no matches
-
-    overlaps = np.array([[overlap(a, b) for b in second] for a in first]).reshape(len(first), len(second))
-    overlaps[overlaps < MIN_OVERLAP] = 0
-    rows, columns = linear_sum_assignment(overlaps, maximize=True)
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if overlaps[i, j] > 0]
-
 
 OCCLUDED_WEIGHT = 0.5
 """Weight of a point of an occluded instance; other points have weight 1."""
@@ -186,7 +140,7 @@ class _Track:
 
     Attributes:
         number: number of the track from 1, in the order of appearance.
-        voxels: voxels of the last view.
+        points: cloud [n, 3] of the last view, in the coordinates of the last frame or, with poses, of the world.
         instance: the last described cloud, which is the last view, merged with earlier views if there are poses.
         overflow: number of points of that cloud outside the descriptor's grid.
         seen: number of the frame of the last view.
@@ -197,7 +151,7 @@ class _Track:
 
     def __init__(self, number: int) -> None:
         self.number, self.frames, self.seen, self.overflow = number, 0, 0, 0
-        self.voxels: OccupiedVoxels = ()
+        self.points: NDArray[np.floating] = np.zeros((0, 3))
         self.instance = EMPTY_INSTANCE
         self.views: deque[PosedInstance] = deque(maxlen=MERGED_VIEWS)
         self.evidence = FusedEvidence()
@@ -215,8 +169,9 @@ class FrameInference(Protocol):
 class Tracker:
     """The objects of a sequence of frames of one camera.
 
-    Without poses, clouds are compared in camera coordinates: the camera may move by a few centimetres between frames.
-    With poses, each view of an object is described twice: alone, and merged with the earlier views.
+    Without poses, clouds are compared in camera coordinates (`match`): the camera may move by a few centimetres between
+    frames, or by up to 15 if it sees several objects. With poses, each view of an object is described twice: alone, and
+    merged with the earlier views.
     """
 
     def __init__(self, recognizer: FrameInference) -> None:
@@ -294,12 +249,14 @@ class Tracker:
     ) -> list[_Track]:
         """Add every instance to its track, or start a new track; return the track of each instance."""
         points = [each.points if world is None else transform(world, each.points) for each in usable]
-        voxels = [occupied_voxels(cloud) for cloud in points]
-        matched = {j: self._tracks[i] for i, j in match([track.voxels for track in self._tracks], voxels)}
+        pairs, motion = match([track.points for track in self._tracks], points)
+        matched = {j: self._tracks[i] for i, j in pairs}
+        for track in self._tracks:  # an object that is seen again later has moved like the others
+            track.points = moved(track.points, -motion)
         tracks = [matched.get(row) or _Track(next(self._numbers)) for row in range(len(usable))]
         self._tracks += [track for track in tracks if not track.frames]
-        for track, instance, occupied in zip(tracks, usable, voxels, strict=True):
-            track.voxels, track.instance = occupied, instance
+        for track, instance, cloud in zip(tracks, usable, points, strict=True):
+            track.points, track.instance = cloud, instance
             track.seen, track.frames = self._frame, track.frames + 1
             if world is not None:
                 track.views.append((instance, world))

@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
-from thor2_jax.tracking.tracker import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
+from thor2_jax.tracking.matching import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
 
 
 def patch(x: float, y: float = 0.0, size: float = 0.08, step: float = 0.004) -> np.ndarray:
@@ -24,22 +25,40 @@ def test_overlap_is_the_share_of_common_voxels() -> None:
 
 def test_a_match_has_the_largest_total_overlap() -> None:
     rng = np.random.default_rng(0)
-    first = [occupied_voxels(patch(*rng.uniform(0, 0.2, 2))) for _ in range(4)]
-    second = [occupied_voxels(patch(*rng.uniform(0, 0.2, 2))) for _ in range(5)]
+    first = [patch(*rng.uniform(0, 0.2, 2)) for _ in range(4)]
+    second = [patch(*rng.uniform(0, 0.2, 2)) for _ in range(5)]
 
-    def total(pairs: list[tuple[int, int]]) -> float:
-        values = [overlap(first[i], second[j]) for i, j in pairs]
+    def total(pairs: list[tuple[int, int]], motion: ArrayLike = (0, 0, 0)) -> float:
+        values = [overlap(occupied_voxels(first[i]), occupied_voxels(second[j] + np.float32(motion))) for i, j in pairs]
         return sum(value for value in values if value >= MIN_OVERLAP)
 
     best = max(total(list(enumerate(order))) for order in itertools.permutations(range(5), 4))
-    pairs = match(first, second)
-    assert total(pairs) == pytest.approx(best) and best > 0.5
+    pairs, motion = match(first, second)
+    assert total(pairs, motion) >= best > 0.5
     assert len({i for i, _ in pairs}) == len({j for _, j in pairs}) == len(pairs)
-    here, near, beside = (occupied_voxels(patch(*place)) for place in ((0, 0), (0.051, 0.036), (0.055, 0.04)))
-    assert match([], second) == match(first, []) == [] and 0.2 < overlap(here, beside) < overlap(here, near) < 0.29
-    assert match([here], [beside, near]) == [(0, 1)] and match([here], [beside]) == []
+    here, near, beside = (patch(*place) for place in ((0, 0), (0.051, 0.036), (0.055, 0.04)))
+    at, *others = map(occupied_voxels, (here, beside, near))
+    assert (
+        match([], second)[0] == match(first, [])[0] == []
+        and 0.2 < overlap(at, others[0]) < overlap(at, others[1]) < 0.29
+    )
+    assert match([here], [beside, near])[0] == [(0, 1)] and match([here], [beside])[0] == []
 
 
 def test_a_small_object_does_not_continue_a_large_one() -> None:
-    large, small, occluded = map(occupied_voxels, (patch(0, 0, 0.16), patch(0.14, 0.06, 0.04), patch(0.04, 0.06, 0.06)))
-    assert match([large], [small]) == [] and match([large], [small, occluded]) == [(0, 1)]
+    large, small, occluded = patch(0, 0, 0.16), patch(0.14, 0.06, 0.04), patch(0.04, 0.06, 0.06)
+    assert match([large], [small])[0] == [] and match([large], [small, occluded])[0] == [(0, 1)]
+
+
+def test_objects_that_move_alike_show_how_the_camera_moved() -> None:
+    before = [patch(0), patch(0.3, 0.1, 0.06), patch(0.1, 0.25, 0.12)]
+    shift = np.array([0.07, -0.05, 0.02])
+    now = [cloud + shift for cloud in before]
+    pairs, motion = match(before, [now[2], patch(0.5), now[0], now[1]])
+    assert sorted(pairs) == [(0, 2), (1, 3), (2, 0)]
+    np.testing.assert_allclose(motion, -shift, rtol=0, atol=1e-6)
+    for moved in ([now[0]], [now[0], *before[1:]], [cloud + 3 * shift for cloud in before]):
+        pairs, motion = match(before[: len(moved)], moved)
+        assert not motion.any()  # of one object, of a minority, and farther than a camera moves between frames
+        assert pairs == [(k, k) for k in range(len(moved)) if moved[k] is before[k]]
+    assert not match(before, [cloud + (0, 0, 0.09) for cloud in (patch(0, 0, 0.05), patch(0.3, 0.1, 0.04))])[1].any()

@@ -106,6 +106,14 @@ def test_poses_match_objects_of_a_camera_that_moved() -> None:
     assert [far.update(f, on_map)[0].track for f in below] == [1, 2]
 
 
+def test_several_objects_are_followed_while_the_camera_moves() -> None:
+    tracker = Tracker(ToyRecognizer())
+    for column, labels in ((0, (1, 2, 3)), (40, (1, 3)), (80, (1, 2, 3))):  # 40 pixels are 47 mm
+        squares = {k: (40 * k - 35, column + 10 * k, SURE_A) for k in labels}
+        answers = tracker.update(frame_of_squares(squares, 30))
+        assert [(answer.label, answer.track) for answer in answers] == [(k, k) for k in labels]
+
+
 def test_views_with_poses_are_described_as_one_cloud() -> None:
     moved = np.eye(4)
     moved[0, 3] = 0.02
