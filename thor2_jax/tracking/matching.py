@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 __all__ = ["match", "moved"]
@@ -32,27 +33,26 @@ SAME_MOTION, FARTHEST = 0.015, 0.15
 _AXIS = 2**21
 """Number of voxels along each axis that have distinct numbers."""
 
-OccupiedVoxels = tuple[NDArray[np.int64], ...]
-"""Numbers of the voxels that a cloud occupies, in increasing order, for each of `VOXELS`."""
+Clouds = Sequence[NDArray[np.floating]]
+"""Points [n, 3] of each instance of a frame, metres."""
 
 
-def occupied_voxels(points: NDArray[np.floating]) -> OccupiedVoxels:
-    """Return the voxels that points [n, 3] in metres occupy, for each of `VOXELS`."""
-    numbers = []
+def overlaps(first: Clouds, second: Clouds) -> NDArray[np.float64]:
+    """Return the overlap, from 0 to 1, of each cloud of `first` with each cloud of `second`, [n, m]."""
+    shares = []
     for size in VOXELS:
-        x, y, z = np.floor(points / size).astype(np.int64).T
-        numbers.append(np.unique((x * _AXIS + y) * _AXIS + z))
-    return tuple(numbers)
+        places = (np.floor(cloud / size).astype(np.int64).T for cloud in (*first, *second))
+        occupied = [np.unique((x * _AXIS + y) * _AXIS + z) for x, y, z in places]
+        counts = np.array([len(each) for each in occupied])
+        ends = np.concatenate([[0], np.cumsum(counts)])
+        voxel = np.unique(np.concatenate([np.zeros(0, int), *occupied]), return_inverse=True)[1]
+        is_occupied = csr_array((np.ones(len(voxel)), voxel, ends), (len(occupied), len(voxel) + 1))
+        common = is_occupied[: len(first)] @ is_occupied[len(first) :].T
+        shares.append(common.toarray() / np.sqrt(np.outer(counts[: len(first)], counts[len(first) :])))
+    return np.asarray(np.mean(shares, axis=0))
 
 
-def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
-    """Return the overlap of two clouds that are not empty, from 0 to 1."""
-    pairs = zip(first, second, strict=True)
-    shares = [len(np.intersect1d(a, b, assume_unique=True)) / np.sqrt(len(a) * len(b)) for a, b in pairs]
-    return float(np.mean(shares))
-
-
-def common_motion(before: Sequence[NDArray[np.floating]], now: Sequence[NDArray[np.floating]]) -> NDArray[np.float64]:
+def common_motion(before: Clouds, now: Clouds) -> NDArray[np.float64]:
     """Return the translation [3], metres, that brings most of the clouds [n, 3] `now` to clouds `before`.
 
     Each pair of clouds of similar size suggests the difference of its means, and a camera at rest suggests zero. The
@@ -78,10 +78,8 @@ def moved(cloud: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[
     return cloud + motion.astype(cloud.dtype)  # another type would round to other voxels
 
 
-def match(
-    before: Sequence[NDArray[np.floating]], now: Sequence[NDArray[np.floating]]
-) -> tuple[list[tuple[int, int]], NDArray[np.float64]]:
-    """Match clouds [n, 3], in metres, of two frames so that their total overlap is largest.
+def match(before: Clouds, now: Clouds) -> tuple[list[tuple[int, int]], NDArray[np.float64]]:
+    """Match the clouds of two frames so that their total overlap is largest.
 
     Returns:
         Pairs of indices into both sequences, each index at most once and without overlaps below `MIN_OVERLAP`; and the
@@ -89,16 +87,11 @@ def match(
     """
     from scipy.optimize import linear_sum_assignment  # takes 0.1 s to import, and one frame needs no matches
 
-    voxels = [occupied_voxels(cloud) for cloud in before]
-
-    def matched(motion: NDArray[np.float64]) -> tuple[float, list[tuple[int, int]], NDArray[np.float64]]:
-        others = [occupied_voxels(moved(cloud, motion)) for cloud in now]
-        overlaps = np.array([[overlap(a, b) for b in others] for a in voxels]).reshape(len(before), len(now))
-        overlaps[overlaps < MIN_OVERLAP] = 0
-        rows, columns = linear_sum_assignment(overlaps, maximize=True)
-        pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if overlaps[i, j] > 0]
-        return float(overlaps[rows, columns].sum()), pairs, motion
-
-    motion = common_motion(before, now)
-    candidates = [np.zeros(3), *([motion] if motion.any() else [])]
-    return max(map(matched, candidates), key=lambda each: each[0])[1:]
+    results = []
+    for motion in dict.fromkeys(((0.0, 0.0, 0.0), tuple(common_motion(before, now).tolist()))):
+        shares = overlaps(before, [moved(cloud, np.array(motion)) for cloud in now])
+        shares[shares < MIN_OVERLAP] = 0
+        rows, columns = linear_sum_assignment(shares, maximize=True)
+        pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if shares[i, j] > 0]
+        results.append((shares[rows, columns].sum(), pairs, np.array(motion)))
+    return max(results, key=lambda each: each[0])[1:]
