@@ -139,6 +139,8 @@ class _Connection:
             InputError: the token cannot be sent in a header.
         """
         check_token(token)
+        if not isinstance(url, str):
+            raise InputError(f"url is of type {type(url).__name__}; expected text, such as http://localhost:8080")
         self._url = url.rstrip("/")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._options: dict[str, Any] = dict(base_url=url, headers=headers, timeout=timeout, follow_redirects=True)

@@ -164,6 +164,7 @@ def test_no_answer_and_arguments_that_the_client_refuses() -> None:
     for wrong in ("127.0.0.1:8080", "http://", "ftp://a", "http://[", ""):
         with pytest.raises(ConnectionError, match="gives no answer"):
             Client(wrong).model()
+    assert_refused("url is of type NoneType; expected text", AsyncClient, None)
     for token in ("", "é", "secret\n"):
         assert_refused("token", Client, url, token)
     assert_refused("clouds", Client(url).describe, [])
