@@ -238,7 +238,7 @@ def answers(model: Model, instances: Sequence[PreparedInstance], inference: Infe
         if overflow > MAX_OVERFLOW * n_points:
             reason = (
                 f"overflow: {overflow} points and pairs of {n_points} points lie outside the descriptor's grid; check "
-                "the intrinsics and the depth scale"
+                "the intrinsics and the depth scale; objects far larger than 40 cm do not fit"
             )
         elif not names:
             reason = "unknown: no object is enrolled"
