@@ -108,8 +108,8 @@ def test_poses_match_objects_of_a_camera_that_moved() -> None:
 
 def test_several_objects_are_followed_while_the_camera_moves() -> None:
     tracker = Tracker(ToyRecognizer())
-    for column, labels in ((0, (1, 2, 3)), (40, (1, 3)), (80, (1, 2, 3))):  # 40 pixels are 47 mm
-        squares = {k: (40 * k - 35, column + 10 * k, SURE_A) for k in labels}
+    for column, labels in ((0, (1, 2, 3)), (48, (1, 3)), (96, (1, 2, 3))):  # 48 pixels are 56 mm
+        squares = {k: (40 * k - 35, column + 8 * k, SURE_A) for k in labels}
         answers = tracker.update(frame_of_squares(squares, 30))
         assert [(answer.label, answer.track) for answer in answers] == [(k, k) for k in labels]
 
