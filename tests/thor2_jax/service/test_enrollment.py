@@ -220,7 +220,7 @@ def test_a_damaged_gallery_stops_changes_but_not_recognition(
     for bad in (b"{", good.replace(b'"embedding": "', b'"embedding": "0'), None):
         index.write_bytes(bad) if bad else index.unlink()
         for answer in (enroll(http, files, "wide", 7), http.delete("/v1/objects/tall"), http.get("/v1/objects")):
-            check_refused(answer, 500, None, "gallery: ", *([] if bad else ["thor2 objects --reembed"]))
+            check_refused(answer, 500, None, "gallery: ", *([] if bad else ["thor2 objects", "--gallery GALLERY"]))
         assert (index.read_bytes() if index.exists() else None) == bad and recognized(http, files)[3] == "tall"
         assert http.get("/v1/model").json()["classes"] == ["a", "b", "tall"]
     assert str(gallery) in caplog.text
