@@ -252,7 +252,7 @@ def update_gallery(
         change: function of the gallery on disk that returns the new one. If it raises, nothing changes on disk.
         fingerprint: fingerprint of the embedding that the gallery must have. None accepts any, for a `change` that
             embeds the views again; if the index is missing, the change then starts from the existing object files.
-        earlier: an earlier state of the gallery, whose objects are not read again.
+        earlier: an earlier state of the gallery, whose objects are not read again; their missing files are written.
         lock_seconds: time to wait for another writer.
 
     Returns:
