@@ -119,14 +119,20 @@ class ServiceError(Exception):
     """
 
     def __init__(self, status: int, field: str | None, message: str, retry_after: float | None) -> None:
-        super().__init__(f"{status}: {message}")
+        super().__init__(status, field, message, retry_after)  # the arguments, with which pickle creates it again
         self.status, self.field, self.message, self.retry_after = status, field, message, retry_after
+
+    def __str__(self) -> str:
+        return f"{self.status}: {self.message}"
 
 
 def multipart(files: Mapping[str, bytes]) -> tuple[str, bytes]:
     """Return the content type and the body of a multipart form with these files."""
     request = httpx.Request("POST", "http://service", files=files)
     return request.headers["Content-Type"], request.read()
+
+
+_tls = functools.cache(ssl.create_default_context)  # creating it takes longer than a request, and it cannot be pickled
 
 
 class _Connection:
@@ -144,7 +150,6 @@ class _Connection:
         self._url = url.rstrip("/")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._options: dict[str, Any] = dict(base_url=url, headers=headers, timeout=timeout, follow_redirects=True)
-        self._options["verify"] = ssl.create_default_context()  # creating it takes longer than a request
 
     @contextlib.contextmanager
     def _no_answer_named(self) -> Iterator[None]:
@@ -272,10 +277,10 @@ class Client(_Connection):
         """Forget an object, and return the generation of the gallery, for `undo`.
 
         Raises:
-            ServiceError: as `describe`; status 404 if no object has this name.
+            ServiceError: as `describe`; status 404 if no object has this name, such as None, that of an unknown object.
             OSError: the service cannot be reached.
         """
-        return self._send("DELETE", f"/v1/objects/{urllib.parse.quote(name, safe='')}", _generation)
+        return self._send("DELETE", f"/v1/objects/{urllib.parse.quote(name or '', safe='')}", _generation)
 
     def undo(self, generation: int) -> int:
         """Undo the change that created this generation of the gallery, and return the new generation.
@@ -288,7 +293,7 @@ class Client(_Connection):
 
     def _send(self, method: str, path: str, parse: Callable[[httpx.Response], T], **body: Any) -> T:
         """Send a request with a body (content, files) and return what `parse` makes of its response."""
-        with self._no_answer_named(), httpx.Client(**self._options) as http:
+        with self._no_answer_named(), httpx.Client(verify=_tls(), **self._options) as http:
             response = http.request(method, path, **body)
         return self._parsed(response, parse)
 
@@ -318,7 +323,7 @@ class AsyncClient(_Connection):
 
     async def _send(self, method: str, path: str, parse: Callable[[httpx.Response], T], **body: Any) -> T:
         with self._no_answer_named():
-            async with httpx.AsyncClient(**self._options) as http:
+            async with httpx.AsyncClient(verify=_tls(), **self._options) as http:
                 response = await http.request(method, path, **body)
         return self._parsed(response, parse)
 

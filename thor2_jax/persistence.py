@@ -162,7 +162,8 @@ def images(
     Gradients flow to the diagrams, `variance` and `exponent`.
 
     Args:
-        diagrams: births, deaths and mask [..., N], from `sublevel_diagrams` or any other source.
+        diagrams: births, deaths and mask [..., N], from `sublevel_diagrams` or any other source, without pairs that are
+            not finite, such as that of the component that never dies.
         birth_range: smallest and largest birth of the image. Static, as are the next two.
         persistence_range: smallest and largest persistence of the image.
         pixels: number of pixels P along births, and Q along persistence.
@@ -173,15 +174,16 @@ def images(
         [..., P, Q] of the type of the births, axes birth and persistence. The image of an empty diagram is zero.
 
     Raises:
-        InputError: `diagrams` is of another type or not floating, a range is not two increasing numbers that are finite
-            and differ in the type of the births, `pixels` is not two positive integers, or `variance` or `exponent` is
-            not a positive number.
+        InputError: `diagrams` is of another type, not floating or not of one shape, a range is not two increasing
+            numbers that are finite and differ in the type of the births, `pixels` is not two positive integers, or
+            `variance` or `exponent` is not a positive number.
     """
     check_types(diagrams=diagrams)
     diagrams = jax.tree.map(lambda values: _as_jax("diagrams", values, "arrays"), diagrams)
-    dtype = getattr(diagrams.births, "dtype", None)
-    if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
-        raise InputError(f"diagrams has births {reprlib.repr(diagrams.births)}; expected floating arrays")
+    dtype, shapes = getattr(diagrams.births, "dtype", None), {getattr(a, "shape", 0) for a in vars(diagrams).values()}
+    if dtype is None or not jnp.issubdtype(dtype, jnp.floating) or len(shapes) > 1:
+        births = reprlib.repr(diagrams.births)
+        raise InputError(f"diagrams has births {births} and shapes {shapes}; expected floating arrays of one shape")
     for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
         numbers = _real_numbers(bounds, (2,), dtype)
         if numbers is None or not -math.inf < numbers[0] < numbers[1] < math.inf:
@@ -205,8 +207,7 @@ def _real_numbers(values: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> 
         numbers = np.asarray(values)
     except ValueError:
         return None
-    kinds = (jnp.integer, jnp.floating)
-    if numbers.shape != shape or not any(jnp.issubdtype(numbers.dtype, kind) for kind in kinds):
+    if numbers.shape != shape or not jnp.issubdtype(numbers.dtype, jnp.number) or np.iscomplexobj(numbers):
         return None
     with np.errstate(over="ignore"):  # infinite numbers are refused
         return numbers.astype(dtype)

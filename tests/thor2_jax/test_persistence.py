@@ -167,7 +167,11 @@ BAD_OPTIONS: dict[str, list[Any]] = {
     "pixels": [(8, 0), (8,), 8, (8, [6])],
     "variance": ["0.1", RAGGED, None, True, 0, np.float32(0), np.full(2, -1.0)],
     "exponent": [1j, -1.0],
-    "diagrams": [np.zeros((3, 2)), *(thor2.Diagrams(*[births] * 3) for births in (np.zeros(3, int), [0.0, 1.0]))],
+    "diagrams": [
+        np.zeros((3, 2)),
+        *(thor2.Diagrams(*[births] * 3) for births in (np.zeros(3, int), [0.0, 1.0])),
+        *(thor2.Diagrams(SOME, np.ones(size, np.float32), SOME > 0) for size in (1, 4)),
+    ],
 }
 
 

@@ -217,7 +217,7 @@ class ObjectGallery:
             InputError: as `refresh`.
             OSError: the gallery cannot be written; it is unchanged.
         """
-        self.directory = directory
+        self.directory = directory = directory.absolute()  # later changes of the working directory do not matter
         if reembed and directory.exists():
             store.check_open_to_changes(directory)
             change = functools.partial(self._reembedded, report, {})

@@ -194,7 +194,7 @@ class Gallery:
         name = find_name(name, (*self.objects, *self.trained)) or name
         is_class = self._is_answered_class(name)
         if name not in self.objects and not is_class:
-            close = first_names(difflib.get_close_matches(name, self.answered_names)) or self.summary
+            close = first_names(difflib.get_close_matches(str(name), self.answered_names)) or self.summary
             raise InputError(f"name: {name!r} is unknown; expected a name that this model recognizes: {close}")
         objects = {other: enrolled for other, enrolled in self.objects.items() if other != name}
         return dataclasses.replace(self, objects=objects, hidden=(*self.hidden, name) if is_class else self.hidden)
@@ -283,8 +283,7 @@ class Gallery:
         """The surfaces of those objects that were enrolled with a mesh, by the number of the object."""
         from thor2_jax.surfaces.surfaces import Surfaces  # imports JAX, which a list of the objects does not need
 
-        arrays = {number: enrolled.surface for number, enrolled in enumerate(self.objects.values())}
-        return {number: Surfaces.of_arrays(each) for number, each in arrays.items() if each is not None}
+        return {k: Surfaces.of_arrays(each.surface) for k, each in enumerate(self.objects.values()) if each.surface}
 
     def with_evidence(self, scores: NDArray[np.float32], samples: "Sample") -> NDArray[np.float32]:
         """Return scores [B, n_objects], changed by the evidence of the surfaces, see `surfaces.evidence`.

@@ -80,11 +80,10 @@ class GalleryBusyError(GalleryError):
 
 def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
     """Return a value that differs after every change of the gallery in a directory; None if there is no gallery."""
-    try:
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
         status = (directory / INDEX_FILE).stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    return status.st_mtime_ns, status.st_ino, status.st_size
+        return status.st_mtime_ns, status.st_ino, status.st_size
+    return None
 
 
 def check_exists(directory: Path | None) -> None:
@@ -213,8 +212,7 @@ def _with_origin(enrolled: GalleryObject, entry: Mapping[str, Any]) -> GalleryOb
 
 def _object_content(name: str, enrolled: GalleryObject) -> bytes:
     arrays = {"embeddings": enrolled.embeddings, **vars(enrolled.clouds)}
-    if enrolled.surface is not None:
-        arrays |= {SURFACE + field: array for field, array in enrolled.surface.items()}
+    arrays |= {SURFACE + field: array for field, array in (enrolled.surface or {}).items()}
     return pack_arrays(arrays, {"object": json.dumps({"name": name, **_origin(enrolled)})})
 
 
@@ -254,7 +252,7 @@ def update_gallery(
         change: function of the gallery on disk that returns the new one. If it raises, nothing changes on disk.
         fingerprint: fingerprint of the embedding that the gallery must have. None accepts any, for a `change` that
             embeds the views again; if the index is missing, the change then starts from the existing object files.
-        earlier: an earlier state of the gallery, whose objects are not read again.
+        earlier: an earlier state of the gallery, whose objects are not read again; their missing files are written.
         lock_seconds: time to wait for another writer.
 
     Returns:
@@ -265,6 +263,7 @@ def update_gallery(
         GalleryBusyError: another process or thread holds the lock.
         OSError: a file cannot be written; the gallery is unchanged.
     """
+    load_gallery(directory, fingerprint, earlier, rebuild=fingerprint is None)  # raises before a directory is created
     with _writing(directory, lock_seconds), new_directory(directory / "objects"):
         before = load_gallery(directory, fingerprint, earlier, rebuild=fingerprint is None)
         changed = dataclasses.replace(change(before), generation=before.generation + 1)
@@ -277,7 +276,8 @@ def update_gallery(
                 written.append(directory / INDEX_FILE)
                 write_text(written[0], _index_content(Gallery(changed.embedding)))
             for name, enrolled in changed.objects.items():
-                if enrolled.file is None:
+                # Another program may have removed the file of an object that this process has in memory.
+                if enrolled.file is None or not _object_file(directory, enrolled.file).exists():
                     content = _object_content(name, enrolled)
                     file = content_digest([content])
                     objects[name] = dataclasses.replace(enrolled, file=file)

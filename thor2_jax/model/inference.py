@@ -88,10 +88,10 @@ def compute_by_chunks(
 def padded_rows(n: int, size: int) -> int:
     """Return the padded number of rows for `n` instances in chunks of `size`: whole largest batches, then a bucket.
 
-    The result is at least `size` / `MIN_PART`, and at least 1.
+    The result is at least `size` / `MIN_PART`, or the largest bucket if that is smaller, and at least 1.
     """
     whole = n // BATCH_BUCKETS[-1] * BATCH_BUCKETS[-1]
-    return n if n == whole > 0 else whole + batch_bucket(max(n - whole, size // MIN_PART, 1))
+    return n if n == whole > 0 else whole + batch_bucket(max(n - whole, min(size // MIN_PART, BATCH_BUCKETS[-1]), 1))
 
 
 N_TOP = 5

@@ -356,7 +356,7 @@ class Service:
         except GalleryError as error:
             log.error("%s", error)
             directory = self.engine.objects.directory
-            message = str(error).replace(f"{directory}/", "").replace(str(directory), "the directory")
+            message = str(error).replace(f"{directory}/", "").replace(str(directory), "GALLERY")
             raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None
         except InputError as error:
             raise RequestError(refused, field, f"{error}.") from None

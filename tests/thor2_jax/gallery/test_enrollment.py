@@ -142,6 +142,16 @@ def test_a_refused_name_leaves_no_directory(tmp_path: Path) -> None:
     assert not (tmp_path / "gallery").exists()
 
 
+def test_a_relative_gallery_stays_where_it_was_opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path)
+    objects = ObjectGallery(("a",), embedding())
+    objects.open(Path("gallery"))
+    monkeypatch.chdir("other")
+    objects.forget("a")
+    assert (tmp_path / "gallery" / "index.json").is_file()
+
+
 def test_a_forgotten_class_is_never_answered() -> None:
     recognizer = thor2.Recognizer(dataclasses.replace(run(), embedding=embedding()))
     first = {answer.name for answer in recognizer.recognize(CLUTTER)}

@@ -163,6 +163,7 @@ def test_an_existing_name_needs_extend_or_replace(gallery: Gallery) -> None:
 
 def test_forgetting_an_unknown_name_is_refused(gallery: Gallery) -> None:
     assert_refused("'cup'", gallery.without, "cup")
+    assert_refused("name: None", gallery.without, None)
     hidden = dataclasses.replace(gallery, trained=("b", "cup")).without("cup")
     assert hidden.hidden == ("cup",) and hidden.names == gallery.names
     assert_refused("'cup'.*: b, ", hidden.without, "cup")

@@ -171,6 +171,14 @@ def test_a_known_state_is_neither_read_again_nor_restored(directory: Path) -> No
     assert update_gallery(directory, add("box", 6), FINGERPRINT, stored).names == ("mug", "bowl", "new", "box")
 
 
+def test_a_removed_file_of_a_known_object_is_written_again(directory: Path) -> None:
+    stored = load_gallery(directory)
+    before = files_of(directory / "objects")
+    shutil.rmtree(directory / "objects")
+    update_gallery(directory, lambda gallery: gallery, FINGERPRINT, stored)
+    assert files_of(directory / "objects") == before and load_gallery(directory).names == stored.names
+
+
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
 @pytest.mark.parametrize("failing", ["_object_content", "write_text", "_write_durably", "os.fsync"])
 def test_a_failed_change_leaves_the_gallery_as_it_was(

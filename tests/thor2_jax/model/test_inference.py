@@ -18,7 +18,7 @@ def instance(label: int) -> PreparedInstance:
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 4, 7, 65])
-@pytest.mark.parametrize("size", [1, 3, 4])
+@pytest.mark.parametrize("size", [1, 3, 4, 10_000])
 def test_chunks_give_the_rows_of_all_usable_instances(n: int, size: int) -> None:
     labels = range(1, n + 1)
     usable = [label for label in labels if label % 3]

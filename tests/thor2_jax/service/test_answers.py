@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import pickle
 import socket
 from pathlib import Path
 from typing import Any
@@ -192,6 +193,14 @@ def test_the_client_sends_colours_and_intrinsics_of_any_type(monkeypatch: pytest
     assert_refused("intrinsics", client.recognize, color=b"", depth=b"", intrinsics={"fx": 1})
     image = np.zeros((2, 2, 3), np.uint8)  # arrays are accepted for labels only
     assert_refused("color is .* ndarray", client.recognize, color=image, depth=b"", intrinsics=b"")
+
+
+def test_clients_and_their_errors_can_be_sent_to_processes() -> None:
+    sent = Client("http://127.0.0.1:9"), ServiceError(404, "name", "absent", None)
+    client, error = pickle.loads(pickle.dumps(sent))
+    assert (str(error), error.field) == ("404: absent", "name")
+    with pytest.raises(ConnectionError):
+        client.model()
 
 
 def test_answers_of_other_servers_are_errors(monkeypatch: pytest.MonkeyPatch) -> None:
