@@ -212,9 +212,8 @@ def recognize(
         segmenter = options.find_segmenter(segment or TABLE, by_model)
         bag, sources = given.open_bag(), []
     names = [source.name for source in sources]
-    as_json = as_json or recording is not None
     frame_poses = None if poses is None else read_poses(poses, names)
-    results = _Answers(outputs, names, several=bool(frames or recording), as_json=as_json)
+    results = _Answers(outputs, names, several=bool(frames or recording), as_json=as_json or recording is not None)
     segmented: Iterable[FrameSource | RecordedFrame] = sources
     with contextlib.ExitStack() as stack:
         if bag is not None:
