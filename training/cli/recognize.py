@@ -192,8 +192,7 @@ def recognize(
 
     given.check()
     frames, recording, table = given.frames, given.bag, {"coco": outputs.coco, "bop": outputs.bop}
-    alone = {"names": outputs.names, **table, "poses": poses} | options.given_values(processes)
-    options.check_alone("bag", recording, **alone)
+    options.check_alone("bag", recording, names=outputs.names, **table, poses=poses, **options.given_values(processes))
     options.check_belongs("--bag", recording, out_bag=outputs.out_bag)
     options.check_belongs("--coco and --bop", any(table.values()), names=outputs.names)
     options.check_belongs("--track", track, poses=poses)
