@@ -6,7 +6,9 @@ for answer in recognize_frames(recognizer.recognize, find_frames([Path("frames")
 
 import dataclasses
 import functools
+import pickle
 import time
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -20,7 +22,7 @@ from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFra
 from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.gallery.store import check_exists
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
-from training.readers.frames import FrameSource
+from training.readers.frames import FrameSource, segmented_source
 
 __all__ = ["RecognizerArguments", "recognize_frames", "track_frames"]
 
@@ -60,14 +62,11 @@ class FrameAnswer:
 
     def as_json(self) -> dict[str, Any]:
         """Return {"frame", "instances"} or {"frame", "error"}; recordings add "depth_gap", boxes and positions."""
-        line: dict[str, Any] = {"frame": self.name}
-        if self.recorded is not None:
-            line["depth_gap"] = self.recorded.gap / 1e9
+        gap = {} if self.recorded is None else {"depth_gap": self.recorded.gap / 1e9}
         if self.error is not None:
-            return {**line, "error": self.error}
-        if self.recorded is not None:
-            return {**line, "instances": detections_as_json(self.detections)}
-        return {**line, "instances": [dataclasses.asdict(answer) for answer in self.recognitions]}
+            return {"frame": self.name, **gap, "error": self.error}
+        own = map(dataclasses.asdict, self.recognitions)
+        return {"frame": self.name, **gap, "instances": detections_as_json(self.detections) if gap else [*own]}
 
 
 def recognize_frames(
@@ -128,13 +127,13 @@ _loaded = functools.lru_cache(1)(RecognizerArguments.load)
 
 
 def track_frames(
-    recognizer: Recognizer, sources: Sequence[FrameSource], poses: Sequence[NDArray[Any]] | None = None
+    recognizer: Recognizer, sources: Sequence[FrameSource], poses: Sequence[NDArray[Any] | None] | None = None
 ) -> Iterator[FrameAnswer]:
     """Read and recognize the frames of one camera as a sequence; the answers are fused over all frames.
 
     A frame that cannot be read, has no labels, or has another size than the first has an `error` and does not stop the
     others. The recognitions are `TrackedRecognition`s. All instances of a track have the name and confidence of the
-    track after the last frame.
+    track after the last frame, or after the last one before an interrupt, which is raised behind the answers.
 
     Args:
         recognizer: the recognizer.
@@ -142,20 +141,24 @@ def track_frames(
         poses: pose of the camera for each frame, see `thor2_jax.tracking.viewpoints`.
     """
     tracker = recognizer.track()
-    answered: list[tuple[FrameAnswer, Sequence[TrackedRecognition]]] = []
+    answered: list[tuple[FrameAnswer, Sequence[TrackedRecognition], bytes]] = []
     last: dict[int | None, TrackedRecognition] = {}
-    for number, source in enumerate(sources):
-        update = functools.partial(tracker.update, pose=None if poses is None else poses[number])
-        (answer,) = recognize_frames(update, [source])
-        tracked = cast(Sequence[TrackedRecognition], answer.recognitions)
-        # A long sequence of images does not fit into memory.
-        answered.append((dataclasses.replace(answer, frame=None), tracked))
-        last |= {each.track: each for each in tracked}
-    for source, (answer, tracked) in zip(sources, answered, strict=True):
-        if answer.error is None:
+    try:
+        for source, pose in zip(sources, poses or [None] * len(sources), strict=True):
+            (answer,) = recognize_frames(functools.partial(tracker.update, pose=pose), [source])
+            tracked = cast(Sequence[TrackedRecognition], answer.recognitions)
+            # A long sequence of images does not fit into memory; their labels do, which are slow to compute again.
+            labels = zlib.compress(pickle.dumps(answer.frame and answer.frame.labels), 1)
+            answered.append((dataclasses.replace(answer, frame=None), tracked, labels))
+            last |= {each.track: each for each in tracked}
+    finally:  # after an interrupt, too
+        for source, (answer, tracked, labels) in zip(sources, answered, strict=False):
             final = [each if each.track is None else each.renamed(last[each.track]) for each in tracked]
-            try:
-                answer = dataclasses.replace(answer, frame=source.read(), recognitions=final)
-            except (InputError, OSError) as error:
-                answer = FrameAnswer(source.name, error=reason_of(error))
-        yield answer
+            again = answer if answer.error is not None else _read_again(source, final, labels)
+            yield dataclasses.replace(again, seconds=answer.seconds)
+
+
+def _read_again(source: FrameSource, recognitions: Sequence[Recognition], labels: bytes) -> FrameAnswer:
+    """Read a frame, which gets packed labels in place of its own; return it with its recognitions."""
+    labelled = segmented_source(source.unsegmented or source, lambda _: pickle.loads(zlib.decompress(labels)))
+    return next(recognize_frames(lambda _: recognitions, [labelled]))

@@ -54,6 +54,7 @@ MAX_IMAGE_PIXELS = 2**26
 """Largest number of pixels of an image that is read: a small file can decompress to gigabytes."""
 
 _EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metres)"
+_DEPTH_FORMATS = "PNG or TIFF of 16-bit integers, TIFF of 32-bit floats, NPY or EXR"
 
 _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
 """Names of the depth channel in EXR files with several channels."""
@@ -257,8 +258,8 @@ def encode_image(image: NDArray[Any] | Image.Image, kind: str = "PNG", **options
     return stream.getvalue()
 
 
-def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple[NDArray[Any], str]:
-    """Read an image file with `decode_image`.
+def read_image(path: str | Path, argument: str, expected: str, lossless: bool = False) -> tuple[NDArray[Any], str]:
+    """Read an image file with `decode_image`; the formats that are expected for the argument stand in the message.
 
     Raises:
         InputError: the file is damaged, not in `IMAGE_FORMATS`, larger than `MAX_IMAGE_PIXELS` or, with `lossless`, has
@@ -266,7 +267,6 @@ def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple
         OSError: the file cannot be opened.
     """
     path = as_path(path, argument)
-    expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
     with open_file(path) as stream, decoding(f"{argument}: {path} is damaged or no image", expected):
         return decode_image(stream, lossless=lossless)
 
@@ -289,7 +289,7 @@ def read_depth(path: str | Path) -> NDArray[Any]:
         with open_file(path) as stream, decoding(f"depth: {path} is a damaged NPY file", _EXPECTED):
             pixels = read_npy(stream, 8 * MAX_IMAGE_PIXELS)
     else:
-        pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
+        pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth", _DEPTH_FORMATS)[0]
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
     kind, size = pixels.dtype.kind, pixels.dtype.itemsize
@@ -326,7 +326,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:
     """Read an 8-bit RGB image [H, W, 3] without its alpha channel; raise errors as `read_frame`."""
-    pixels, mode = read_image(path, "color")
+    pixels, mode = read_image(path, "color", "PNG, JPEG or TIFF")
     if mode not in ("RGB", "RGBA"):
         raise InputError(f"color: {path} has the mode {mode}; expected 8-bit RGB")
     return np.ascontiguousarray(pixels[..., :3])
@@ -334,7 +334,7 @@ def read_color(path: str | Path) -> NDArray[np.uint8]:
 
 def read_labels(path: str | Path) -> NDArray[Any]:
     """Read a one-channel or indexed image [H, W] of integers; raise errors as `read_frame`."""
-    pixels, _ = read_image(path, "labels", lossless=True)
+    pixels, _ = read_image(path, "labels", "PNG or TIFF without JPEG compression", lossless=True)
     if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
         raise InputError(
             f"labels: {path} has shape {pixels.shape} and type {pixels.dtype}; expected one channel of integers"

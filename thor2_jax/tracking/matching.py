@@ -9,6 +9,7 @@ A camera that moves, or turns a little, moves all objects alike. The motion that
 from the means of the clouds, and undone if that increases the overlap.
 """
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -63,14 +64,18 @@ def common_motion(before: Clouds, now: Clouds) -> NDArray[np.float64]:
     motions = means[0][:, None] - means[1]
     length = np.linalg.norm(motions, axis=2)
     similar = np.minimum.outer(*sizes) >= SIMILAR_SIZE * np.maximum.outer(*sizes)
-    first, second = np.nonzero(similar & (length <= FARTHEST))
-    order = np.argsort(length[first, second])
-    pairs = np.array([(-1, -1), *zip(first[order], second[order], strict=True)])
-    suggested = np.concatenate([np.zeros((1, 3)), motions[first, second][order]])
-    agreeing = KDTree(suggested).query_ball_point(suggested, SAME_MOTION)
-    votes = [min(len(np.unique(pairs[each, side])) for side in (0, 1)) for each in agreeing]
-    best = int(np.argmax(votes))
-    return suggested[agreeing[best]].mean(axis=0) if best else np.zeros(3)
+    pairs = np.argwhere(similar & (length <= FARTHEST))
+    pairs = np.pad(pairs[np.argsort(length[*pairs.T])], ((1, 0), (0, 0)), constant_values=-1)
+    suggested = np.concatenate([np.zeros((1, 3)), motions[*pairs[1:].T]])
+    agreeing = functools.partial(KDTree(suggested).query_ball_point, r=SAME_MOTION, return_sorted=True)
+
+    def votes(number: int) -> int:
+        return min(len(np.unique(objects)) for objects in pairs[agreeing(suggested[number])].T)
+
+    # In a crowd, the lists of all agreeing suggestions take gigabytes; their lengths show which can have most votes.
+    most = agreeing(suggested, return_length=True)
+    best = max(np.flatnonzero(most >= votes(int(most.argmax()))).tolist(), key=votes)
+    return suggested[agreeing(suggested[best])].mean(axis=0) if best else np.zeros(3)
 
 
 def moved(cloud: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[np.floating]:

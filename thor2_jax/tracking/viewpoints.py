@@ -85,8 +85,7 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
         if not isinstance(stored, (dict, list)):
             raise TypeError(f"it contains a {type(stored).__name__}")
     if isinstance(stored, dict):
-        missing = [name for name in names if name not in stored]
-        if missing:
+        if missing := [name for name in names if name not in stored]:
             raise InputError(f"poses: {path} has no pose of frame {missing[0]}; expected one for each frame")
         stored = [stored[name] for name in names]
     if len(stored) != len(names):

@@ -192,8 +192,7 @@ def recognize(
 
     given.check()
     frames, recording, table = given.frames, given.bag, {"coco": outputs.coco, "bop": outputs.bop}
-    alone = {"names": outputs.names, **table, "poses": poses} | options.given_values(processes)
-    options.check_alone("bag", recording, **alone)
+    options.check_alone("bag", recording, names=outputs.names, **table, poses=poses, **options.given_values(processes))
     options.check_belongs("--bag", recording, out_bag=outputs.out_bag)
     options.check_belongs("--coco and --bop", any(table.values()), names=outputs.names)
     options.check_belongs("--track", track, poses=poses)
@@ -212,9 +211,8 @@ def recognize(
         segmenter = options.find_segmenter(segment or TABLE, by_model)
         bag, sources = given.open_bag(), []
     names = [source.name for source in sources]
-    as_json = as_json or recording is not None
     frame_poses = None if poses is None else read_poses(poses, names)
-    results = _Answers(outputs, names, several=bool(frames or recording), as_json=as_json)
+    results = _Answers(outputs, names, several=bool(frames or recording), as_json=as_json or recording is not None)
     segmented: Iterable[FrameSource | RecordedFrame] = sources
     with contextlib.ExitStack() as stack:
         if bag is not None:

@@ -88,11 +88,13 @@ class FrameSource:
         name: folder of the frame, or scene and image.
         read: function that returns the frame; raises InputError and OSError. It is pickled for worker processes.
         files: files of the frame; None for segmented frames and for frames of a BOP scene or a recording.
+        unsegmented: the frame before it is segmented; None for frames that are read with their own labels.
     """
 
     name: str
     read: Callable[[], RGBDFrame]
     files: FrameFiles | None = None
+    unsegmented: "FrameSource | RecordedFrame | None" = None
 
 
 def frame_files(folder: Path) -> FrameFiles:
@@ -227,7 +229,7 @@ def _listed(labels: Iterable[int]) -> str:
 
 def segmented_source(source: FrameSource | RecordedFrame, segmenter: Segmenter) -> FrameSource:
     """Return a frame that is segmented when it is read; existing labels are replaced."""
-    return FrameSource(source.name, functools.partial(_read_segmented, source, segmenter))
+    return FrameSource(source.name, functools.partial(_read_segmented, source, segmenter), unsegmented=source)
 
 
 def _read_segmented(source: FrameSource | RecordedFrame, segmenter: Segmenter) -> RGBDFrame:

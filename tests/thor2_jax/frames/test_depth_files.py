@@ -38,6 +38,14 @@ def test_images_written_by_opencv_and_pillow(tmp_path: Path, name: str, values: 
     assert_depth(tmp_path / name, values)
 
 
+def test_formats_of_depth_are_those_in_the_message(tmp_path: Path) -> None:
+    """Pillow does not read floats of 64 bits in TIFF, the default of NumPy."""
+    assert cv2.imwrite(str(tmp_path / "d.tiff"), METRES.astype(np.float64))
+    np.savez(tmp_path / "d.npz", METRES)
+    for name in ("d.tiff", "d.npz"):
+        assert_refused(f"^depth: .*{name}.*32-bit.*NPY", read_depth, tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("written", "expected"),
     [

@@ -1,6 +1,7 @@
 """Matching of clouds by their overlap."""
 
 import itertools
+import tracemalloc
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,3 +64,15 @@ def test_objects_that_move_alike_show_how_the_camera_moved() -> None:
     pairs, motion = match(four, [cloud + (0.09 if k < 2 else 0.04) * along_x for k, cloud in enumerate(four)])
     assert pairs == [(2, 2), (3, 3)]
     np.testing.assert_allclose(motion, -0.04 * along_x, rtol=0, atol=1e-6)
+
+
+def test_a_crowd_takes_little_memory() -> None:
+    """Each of 400 objects may be one of many neighbours of the same size."""
+    crowd = [np.float32([[x, y, 0.7]]) for x in range(20) for y in range(20)]
+    before = [np.float32([0.02, 0.02, 1]) * cloud for cloud in crowd]
+    tracemalloc.start()
+    _, motion = match(before, [cloud + np.float32([0.004, 0, 0.02]) for cloud in before])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(motion, [-0.004, 0, -0.02], rtol=0, atol=1e-3)
+    assert peak < 2**26

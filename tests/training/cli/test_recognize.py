@@ -22,6 +22,7 @@ from written_files import files_of
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.result_files import RESULT_FILES
+from thor2_jax.segmentation import table
 from training.cli import recognize as recognize_command
 from training.readers.frames import FrameFiles
 
@@ -261,6 +262,35 @@ def test_bad_frames_end_no_sequence(model: Path, tmp_path: Path, monkeypatch: py
     for number, reason in ((1, "depth"), (2, "labels"), (3, "No such file"), (5, "100 x 90 pixels")):
         assert reason in answers[number]["error"] and "instances" not in answers[number]
     assert "4 of 6 frames" in err
+
+
+def test_an_interrupted_sequence_keeps_its_answers(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(3)]
+    read = FrameFiles.read
+
+    def read_until_interrupt(files: FrameFiles, depth_scale: float | None) -> RGBDFrame:
+        if files.color.parent == frames[2]:
+            raise KeyboardInterrupt
+        return read(files, depth_scale)
+
+    monkeypatch.setattr(FrameFiles, "read", read_until_interrupt)
+    command = ("recognize", "--model", model, tmp_path / "video", "--track")
+    assert run_thor2(*command, "--coco", tmp_path / "coco.json") == 130
+    assert {entry["frame"] for entry in json.loads((tmp_path / "coco.json").read_text())} == {"0", "1"}
+
+
+def test_each_frame_of_a_sequence_is_segmented_once(
+    recognize: Recognize, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segmenter = mock.Mock(side_effect=table.segment_table)
+    monkeypatch.setattr(table, "segment_table", segmenter)
+    for number, frame in enumerate(FRAMES):
+        write_frame_files(tmp_path / "video" / f"{number}", frame)
+    answers = recognize(tmp_path / "video", "--track", "--segment", "table", "--json", "--out", tmp_path / "out")
+    assert [len(answer["instances"]) for answer in answers] == [2] * len(FRAMES)
+    assert (tmp_path / "out" / "2" / "overlay.png").is_file() and segmenter.call_count == len(FRAMES)
 
 
 def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
