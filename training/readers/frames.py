@@ -10,6 +10,7 @@ import functools
 import itertools
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -41,6 +42,8 @@ FILE_NAMES = {
     ),
 }
 """Possible names for each file of a frame; the first existing file is read."""
+
+_NUMBER = re.compile(r"(\d+)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +116,7 @@ def frame_files(folder: Path) -> FrameFiles:
 
 
 def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list[FrameSource]:
-    """Find the frames in folders and return them sorted by name; the names are unique.
+    """Find the frames in folders and return them in the order of their names, 2 before 10; the names are unique.
 
     Args:
         paths: frame folders, folders that contain frame folders or links to them, at any depth, and BOP splits or
@@ -140,7 +143,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
             # A frame without colour is found, too, to report it. A link such as "latest" adds no frame a second time.
             images, of_path, visited = {*FILE_NAMES["color"], *FILE_NAMES["depth"]}, [], set[str]()
             for root, folders, files in os.walk(path, followlinks=True):
-                folders.sort()
+                folders.sort(key=lambda name: ([int(p) if p.isdecimal() else p for p in _NUMBER.split(name)], name))
                 if (real := os.path.realpath(root)) in visited:
                     folders.clear()
                 elif not images.isdisjoint(files):

@@ -100,6 +100,13 @@ def test_frames_of_one_name_in_two_folders(tmp_path: Path) -> None:
         assert_refused("000 is given twice", find_frames, [tmp_path / "b", tmp_path / again])
 
 
+def test_frames_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    names = ["1-2/frame", "1-10/frame", "2a", "2b", "02c", "10", "x9/y2", "x9/y10", "x10"]
+    for name in names:
+        write_folder(tmp_path / name, {})
+    assert [source.name for source in find_frames([tmp_path])] == names
+
+
 RECORDED = [table_frame(k) for k in range(3)]
 
 
