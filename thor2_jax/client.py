@@ -132,7 +132,7 @@ def multipart(files: Mapping[str, bytes]) -> tuple[str, bytes]:
     return request.headers["Content-Type"], request.read()
 
 
-_tls = functools.cache(ssl.create_default_context)  # creating it takes longer than a request, and it cannot be pickled
+_tls_context = functools.cache(ssl.create_default_context)  # slower than a request, and it cannot be pickled
 
 
 class _Connection:
@@ -277,7 +277,7 @@ class Client(_Connection):
         """Forget an object, and return the generation of the gallery, for `undo`.
 
         Raises:
-            ServiceError: as `describe`; status 404 if no object has this name, such as None, that of an unknown object.
+            ServiceError: as `describe`; status 404 if no object has this name. No object is named None.
             OSError: the service cannot be reached.
         """
         return self._send("DELETE", f"/v1/objects/{urllib.parse.quote(name or '', safe='')}", _generation)
@@ -293,7 +293,7 @@ class Client(_Connection):
 
     def _send(self, method: str, path: str, parse: Callable[[httpx.Response], T], **body: Any) -> T:
         """Send a request with a body (content, files) and return what `parse` makes of its response."""
-        with self._no_answer_named(), httpx.Client(verify=_tls(), **self._options) as http:
+        with self._no_answer_named(), httpx.Client(verify=_tls_context(), **self._options) as http:
             response = http.request(method, path, **body)
         return self._parsed(response, parse)
 
@@ -323,7 +323,7 @@ class AsyncClient(_Connection):
 
     async def _send(self, method: str, path: str, parse: Callable[[httpx.Response], T], **body: Any) -> T:
         with self._no_answer_named():
-            async with httpx.AsyncClient(verify=_tls(), **self._options) as http:
+            async with httpx.AsyncClient(verify=_tls_context(), **self._options) as http:
                 response = await http.request(method, path, **body)
         return self._parsed(response, parse)
 

@@ -180,7 +180,8 @@ def images(
     """
     check_types(diagrams=diagrams)
     diagrams = jax.tree.map(lambda values: _as_jax("diagrams", values, "arrays"), diagrams)
-    dtype, shapes = getattr(diagrams.births, "dtype", None), {getattr(a, "shape", 0) for a in vars(diagrams).values()}
+    dtype = getattr(diagrams.births, "dtype", None)
+    shapes = {getattr(a, "shape", None) for a in vars(diagrams).values()}
     if dtype is None or not jnp.issubdtype(dtype, jnp.floating) or len(shapes) > 1:
         births = reprlib.repr(diagrams.births)
         raise InputError(f"diagrams has births {births} and shapes {shapes}; expected floating arrays of one shape")

@@ -62,11 +62,14 @@ class FrameAnswer:
 
     def as_json(self) -> dict[str, Any]:
         """Return {"frame", "instances"} or {"frame", "error"}; recordings add "depth_gap", boxes and positions."""
-        gap = {} if self.recorded is None else {"depth_gap": self.recorded.gap / 1e9}
+        line: dict[str, Any] = {"frame": self.name}
+        if self.recorded is not None:
+            line["depth_gap"] = self.recorded.gap / 1e9
         if self.error is not None:
-            return {"frame": self.name, **gap, "error": self.error}
-        own = map(dataclasses.asdict, self.recognitions)
-        return {"frame": self.name, **gap, "instances": detections_as_json(self.detections) if gap else [*own]}
+            return {**line, "error": self.error}
+        if self.recorded is not None:
+            return {**line, "instances": detections_as_json(self.detections)}
+        return {**line, "instances": [dataclasses.asdict(answer) for answer in self.recognitions]}
 
 
 def recognize_frames(
@@ -133,7 +136,7 @@ def track_frames(
 
     A frame that cannot be read, has no labels, or has another size than the first has an `error` and does not stop the
     others. The recognitions are `TrackedRecognition`s. All instances of a track have the name and confidence of the
-    track after the last frame, or after the last one before an interrupt, which is raised behind the answers.
+    track after the last frame. An interrupt is raised after the answers so far are yielded.
 
     Args:
         recognizer: the recognizer.
@@ -144,13 +147,13 @@ def track_frames(
     answered: list[tuple[FrameAnswer, Sequence[TrackedRecognition], bytes]] = []
     last: dict[int | None, TrackedRecognition] = {}
     try:
-        for source, pose in zip(sources, poses or [None] * len(sources), strict=True):
+        for source, pose in zip(sources, [None] * len(sources) if poses is None else poses, strict=True):
             (answer,) = recognize_frames(functools.partial(tracker.update, pose=pose), [source])
             tracked = cast(Sequence[TrackedRecognition], answer.recognitions)
             # A long sequence of images does not fit into memory; their labels do, which are slow to compute again.
             labels = zlib.compress(pickle.dumps(answer.frame and answer.frame.labels), 1)
-            answered.append((dataclasses.replace(answer, frame=None), tracked, labels))
             last |= {each.track: each for each in tracked}
+            answered.append((dataclasses.replace(answer, frame=None), tracked, labels))
     finally:  # after an interrupt, too
         for source, (answer, tracked, labels) in zip(sources, answered, strict=False):
             final = [each if each.track is None else each.renamed(last[each.track]) for each in tracked]
@@ -159,6 +162,6 @@ def track_frames(
 
 
 def _read_again(source: FrameSource, recognitions: Sequence[Recognition], labels: bytes) -> FrameAnswer:
-    """Read a frame, which gets packed labels in place of its own; return it with its recognitions."""
+    """Read a frame again, with these packed labels in place of its own, and return it with its recognitions."""
     labelled = segmented_source(source.unsegmented or source, lambda _: pickle.loads(zlib.decompress(labels)))
     return next(recognize_frames(lambda _: recognitions, [labelled]))

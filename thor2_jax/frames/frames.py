@@ -259,7 +259,7 @@ def encode_image(image: NDArray[Any] | Image.Image, kind: str = "PNG", **options
 
 
 def read_image(path: str | Path, argument: str, expected: str, lossless: bool = False) -> tuple[NDArray[Any], str]:
-    """Read an image file with `decode_image`; the formats that are expected for the argument stand in the message.
+    """Read an image file with `decode_image`; messages say that the formats `expected` are expected.
 
     Raises:
         InputError: the file is damaged, not in `IMAGE_FORMATS`, larger than `MAX_IMAGE_PIXELS` or, with `lossless`, has
@@ -267,7 +267,7 @@ def read_image(path: str | Path, argument: str, expected: str, lossless: bool = 
         OSError: the file cannot be opened.
     """
     path = as_path(path, argument)
-    with open_file(path) as stream, decoding(f"{argument}: {path} is damaged or no image", expected):
+    with open_file(path) as stream, decoding(f"{argument}: {path} cannot be read as an image", expected):
         return decode_image(stream, lossless=lossless)
 
 

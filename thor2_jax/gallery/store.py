@@ -80,10 +80,11 @@ class GalleryBusyError(GalleryError):
 
 def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
     """Return a value that differs after every change of the gallery in a directory; None if there is no gallery."""
-    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+    try:
         status = (directory / INDEX_FILE).stat()
-        return status.st_mtime_ns, status.st_ino, status.st_size
-    return None
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return status.st_mtime_ns, status.st_ino, status.st_size
 
 
 def check_exists(directory: Path | None) -> None:
@@ -263,9 +264,10 @@ def update_gallery(
         GalleryBusyError: another process or thread holds the lock.
         OSError: a file cannot be written; the gallery is unchanged.
     """
-    load_gallery(directory, fingerprint, earlier, rebuild=fingerprint is None)  # raises before a directory is created
+    rebuild = fingerprint is None
+    earlier = load_gallery(directory, fingerprint, earlier, rebuild=rebuild)  # raises before a directory is created
     with _writing(directory, lock_seconds), new_directory(directory / "objects"):
-        before = load_gallery(directory, fingerprint, earlier, rebuild=fingerprint is None)
+        before = load_gallery(directory, fingerprint, earlier, rebuild=rebuild)
         changed = dataclasses.replace(change(before), generation=before.generation + 1)
         _remove_orphans(directory, {enrolled.file for each in (before, changed) for enrolled in each.objects.values()})
         objects = dict(changed.objects)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, Intrinsics
-from thor2_jax.segmentation.pixels import Mask, pixel_mask
+from thor2_jax.segmentation.pixels import Mask, components, pixel_mask
 
 __all__ = ["DepthImage", "Plane", "dominant_planes"]
 
@@ -41,6 +41,9 @@ LEAST_FILLING = 0.25
 
 PARALLEL, LARGEST_THING = 0.97, 0.15
 """Smallest cosine between the normals of a plane and of the tops of objects on it, and their largest height, metres."""
+
+LARGEST_TOP, TRAY_FILLING = 0.15, 0.5
+"""Largest connected area of such tops, square metres; a larger one that fills its hull to this fraction is a tray."""
 
 
 class DepthImage:
@@ -139,8 +142,12 @@ def dominant_planes(depth: DepthImage) -> list[Plane]:
         pixels = np.stack([points.columns[inliers], points.rows[inliers]], axis=1).astype(np.int32)
         hull = np.asarray(cv2.convexHull(pixels), np.int32)[:, 0]
         filling = len(inliers) * points.step**2 / max(cv2.contourArea(hull), 1.0)
-        extent = _least_extent(points, inliers)
-        tops = any(_is_just_above(plane.coefficients, coefficients) for plane in planes)
+        extent, length = _extents(points, inliers)
+        grid = np.zeros(depth.z.shape, bool)[:: points.step, :: points.step]
+        grid[points.rows[inliers] // points.step, points.columns[inliers] // points.step] = True
+        connected = extent * length * components(grid)[1].max() / len(inliers)
+        is_tray = connected > LARGEST_TOP and filling > TRAY_FILLING
+        tops = not is_tray and any(_is_just_above(plane.coefficients, coefficients) for plane in planes)
         if not tops and filling >= LEAST_FILLING and extent >= (LEAST_EXTENT if planes else LEAST_EXTENT_OF_LARGEST):
             planes.append(Plane(coefficients, hull, share, float(1 / np.median(points.inverse[inliers]))))
         left = np.setdiff1d(left, inliers)
@@ -188,7 +195,8 @@ def _refine(
     return left[near], coefficients
 
 
-def _least_extent(points: _Points, inliers: NDArray[np.intp]) -> float:
-    """Return the width, metres, of a uniform rectangle that spreads like the points across its longest direction."""
+def _extents(points: _Points, inliers: NDArray[np.intp]) -> tuple[float, float]:
+    """Return the width and the length, metres, of a uniform rectangle that spreads like the points."""
     positions = points.terms[inliers, :3] / points.inverse[inliers, None]
-    return float(np.sqrt(12 * max(np.linalg.eigvalsh(np.cov(positions.T))[1], 0.0)))
+    _, width, length = np.sqrt(12 * np.linalg.eigvalsh(np.cov(positions.T)).clip(0))
+    return float(width), float(length)

@@ -5,6 +5,7 @@ import contextlib
 import copy
 import dataclasses
 import logging
+import shlex
 import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
@@ -356,7 +357,8 @@ class Service:
         except GalleryError as error:
             log.error("%s", error)
             directory = self.engine.objects.directory
-            message = str(error).replace(f"{directory}/", "").replace(str(directory), "GALLERY")
+            message = str(error).replace(f"--gallery {shlex.quote(str(directory))}", "--gallery GALLERY")
+            message = message.replace(f"{directory}/", "").replace(str(directory), "the directory")
             raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None
         except InputError as error:
             raise RequestError(refused, field, f"{error}.") from None

@@ -83,17 +83,24 @@ def moved(cloud: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[
     return cloud + motion.astype(cloud.dtype)  # another type would round to other voxels
 
 
-def match(before: Clouds, now: Clouds) -> tuple[list[tuple[int, int]], NDArray[np.float64]]:
+def match(before: Clouds, now: Clouds, is_moving: bool = True) -> tuple[list[tuple[int, int]], NDArray[np.float64]]:
     """Match the clouds of two frames so that their total overlap is largest.
+
+    Args:
+        before: clouds of the earlier frame.
+        now: clouds of the later frame.
+        is_moving: whether a motion may be common to the clouds; False in world coordinates.
 
     Returns:
         Pairs of indices into both sequences, each index at most once and without overlaps below `MIN_OVERLAP`; and the
-        translation [3] of the clouds `now`: zero or `common_motion`, whichever gives the larger overlap.
+        translation [3] of the clouds `now`: zero or, if the camera is moving, `common_motion`, whichever gives the
+        larger overlap.
     """
     from scipy.optimize import linear_sum_assignment  # takes 0.1 s to import, and one frame needs no matches
 
     results = []
-    for motion in dict.fromkeys(((0.0, 0.0, 0.0), tuple(common_motion(before, now).tolist()))):
+    common = common_motion(before, now) if is_moving else np.zeros(3)
+    for motion in dict.fromkeys(((0.0, 0.0, 0.0), tuple(common.tolist()))):
         shares = overlaps(before, [moved(cloud, np.array(motion)) for cloud in now])
         shares[shares < MIN_OVERLAP] = 0
         rows, columns = linear_sum_assignment(shares, maximize=True)

@@ -169,9 +169,9 @@ class FrameInference(Protocol):
 class Tracker:
     """The objects of a sequence of frames of one camera.
 
-    Without poses, clouds are compared in camera coordinates (`match`): the camera may move by a few centimetres between
-    frames, or by up to 15 if it sees several objects. With poses, each view of an object is described twice: alone, and
-    merged with the earlier views.
+    Without poses, clouds are compared in camera coordinates (`thor2_jax.tracking.matching`): the camera may move by
+    about two centimetres between frames, or by about twelve if it sees several objects. With poses, each view of an
+    object is described twice: alone, and merged with the earlier views.
     """
 
     def __init__(self, recognizer: FrameInference) -> None:
@@ -249,7 +249,7 @@ class Tracker:
     ) -> list[_Track]:
         """Add every instance to its track, or start a new track; return the track of each instance."""
         points = [each.points if world is None else transform(world, each.points) for each in usable]
-        pairs, motion = match([track.points for track in self._tracks], points)
+        pairs, motion = match([track.points for track in self._tracks], points, is_moving=world is None)
         matched = {j: self._tracks[i] for i, j in pairs}
         for track in self._tracks:  # an object that is seen again later has moved like the others
             track.points = moved(track.points, -motion)

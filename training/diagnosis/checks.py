@@ -72,7 +72,7 @@ def check_camera(diagnosis: Diagnosis, intrinsics: Intrinsics, width: int, heigh
             reason, advice = "cx and cy are exchanged", "Exchange cx and cy (and fx and fy)."
         else:
             reason = f"it suits an image of about {2 * cx:.0f} x {2 * cy:.0f} pixels: K does not fit the image size"
-            advice = ADVICE + " After cropping, the margins are subtracted from cx and cy; if they were, K is right."
+            advice = ADVICE + " If the image is cropped, subtract its left and upper margins from cx and cy."
         diagnosis.add(
             "intrinsics-size",
             f"The principal point cx, cy = {cx:g}, {cy:g} is far from the centre of the image of {width} x {height} "

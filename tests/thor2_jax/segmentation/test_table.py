@@ -22,6 +22,12 @@ ON_TABLE = [
     Box(-0.15, 0.03, (0.04, 0.06), 0.12, RED, bottom=0.4),
     Box(-0.45, 0.1, (0.05, 0.05), 0.1, YELLOW),
 ]
+TRAY = [
+    Box(0.0, 0.0, (0.25, 0.2), 0.02, (200, 200, 190)),
+    Box(-0.13, 0.05, (0.04, 0.05), 0.1, RED, bottom=0.02),
+    Box(0.0, -0.09, (0.05, 0.03), 0.06, BLUE, bottom=0.02),
+    Box(0.35, 0.05, (0.04, 0.05), 0.1, YELLOW),
+]
 STRIPS = [Box(-0.15, 0.0, (0.08, 0.008), 0, BLUE), Box(0.1, 0.1, (0.008, 0.07), 0, (20, 20, 20))]
 
 
@@ -42,12 +48,14 @@ SCENES: dict[str, tuple[list[Box], tuple[float, ...], float]] = {
     "touching in the image": (TOUCHING, (55,), 0.93),
     "meeting at a fold": (STACKED, (50, 0, 0, 0.6), 0.95),
     "on a table and on the floor": (ON_TABLE, (30, 0, 0, 1.3), 0.92),
+    "on a tray and beside it": (TRAY, (40,), 0.83),
+    "flat and large": ([Box(0.0, 0.0, (0.18, 0.18), 0.05, RED)], (20,), 0.9),
     "half of the image": ([Box(0.0, 0.0, (0.12, 0.1), 0.05, RED)], (30, 0, 0, 0.36), 0.95),
     "on a sheet": ([Box(0.0, 0.0, (0.14, 0.1), 0, BLUE), Box(0.0, 0.0, (0.03, 0.03), 0.06, RED)], (20,), 0.9),
     "flat strips": (STRIPS, (30,), 0.95),
     **{f"books of {height} m": (books(height), (45, 0, 0, 1.1), 0.94) for height in (0.004, 0.02)},
 }
-"""Name -> boxes, pose of the camera, and least overlap with a piece of each box, except for tables."""
+"""Name -> boxes, pose of the camera, and least overlap with a piece of each box, except for tables and trays."""
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -56,7 +64,7 @@ def test_each_box_of_a_scene_is_a_thing(name: str) -> None:
     frame = render(boxes, *pose)
     before = frame.color.copy(), frame.depth.copy()
     labels = segment_table(dataclasses.replace(frame, labels=None))
-    things = [box.half[0] < 0.3 for box in boxes]
+    things = [box.half[0] < 0.2 for box in boxes]
     assert labels.dtype == np.int32 and sorted(np.unique(labels)) == list(range(sum(things) + 1))
     assert (best_overlaps(labels, frame.label_image)[things] > least).all()
     np.testing.assert_array_equal(segment_table(frame), labels)  # its own labels are not read

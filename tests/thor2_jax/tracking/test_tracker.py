@@ -106,6 +106,17 @@ def test_poses_match_objects_of_a_camera_that_moved() -> None:
     assert [far.update(f, on_map)[0].track for f in below] == [1, 2]
 
 
+def test_poses_keep_a_camera_apart_from_a_row_of_equal_objects() -> None:
+    """When the camera moves on by two of them, each lies in the image where the second next was."""
+    tracker = Tracker(ToyRecognizer())
+    for first in (0, 2, 4):
+        pose = np.eye(4)
+        pose[0, 3] = 0.07 * first  # 60 pixels at a depth of 0.7 m
+        seen = {first + k + 1: (40, 60 * k + 5, SURE_A) for k in range(3)}
+        answers = tracker.update(frame_of_squares(seen, 30, (120, 200)), pose)
+        assert [(answer.label, answer.track) for answer in answers] == [(k, k) for k in seen]
+
+
 def test_several_objects_are_followed_while_the_camera_moves() -> None:
     tracker = Tracker(ToyRecognizer())
     for column, labels in ((0, (1, 2, 3)), (48, (1, 3)), (96, (1, 2, 3))):  # 48 pixels are 56 mm

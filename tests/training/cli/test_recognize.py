@@ -265,7 +265,7 @@ def test_bad_frames_end_no_sequence(model: Path, tmp_path: Path, monkeypatch: py
 
 
 def test_an_interrupted_sequence_keeps_its_answers(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(3)]
     read = FrameFiles.read
@@ -277,7 +277,8 @@ def test_an_interrupted_sequence_keeps_its_answers(
 
     monkeypatch.setattr(FrameFiles, "read", read_until_interrupt)
     command = ("recognize", "--model", model, tmp_path / "video", "--track")
-    assert run_thor2(*command, "--coco", tmp_path / "coco.json") == 130
+    assert run_thor2(*command, "--json", "--coco", tmp_path / "coco.json") == 130
+    assert [json.loads(line)["frame"] for line in capsys.readouterr().out.splitlines()] == ["0", "1"]
     assert {entry["frame"] for entry in json.loads((tmp_path / "coco.json").read_text())} == {"0", "1"}
 
 
