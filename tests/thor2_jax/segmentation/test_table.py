@@ -165,6 +165,13 @@ def test_soft_shadows_and_patterns_are_not_things() -> None:
     assert_one_thing(frame, color=(frame.color + squares).clip(0, 255).astype(np.uint8))
 
 
+def test_the_top_of_a_frame_is_no_tray() -> None:
+    """A picture frame of 38 cm x 44 cm has a connected top, which fills less than half of its hull."""
+    across = [Box(0.0, y, (0.19, 0.02), 0.03, RED) for y in (-0.2, 0.2)]
+    frame = render([*across, *(Box(x, 0.0, (0.02, 0.18), 0.03, RED) for x in (-0.17, 0.17))], 20)
+    assert_one_thing(dataclasses.replace(frame, labels=(frame.label_image > 0).astype(np.int32)))
+
+
 def test_a_deep_shadow_beside_a_thing_is_no_thing() -> None:
     frame = render([Box(0.0, 0.0, (0.06, 0.04), 0.12, YELLOW)])
     shadow = np.roll(frame.label_image, (4, 14), axis=(0, 1)).astype(bool) & (frame.label_image == 0)
