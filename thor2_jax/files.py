@@ -393,5 +393,5 @@ def read_table(path: Path, kinds: tuple[type, ...] = (dict,)) -> Any:
         raise InputError(f"{path} is damaged ({error})") from None
     if not isinstance(table, kinds):
         expected = "a table or a list" if list in kinds else "a table"
-        raise InputError(f"{path} holds a {type(table).__name__}; expected {expected}")
+        raise InputError(f"{path} holds a value of type {type(table).__name__}; expected {expected}")
     return table

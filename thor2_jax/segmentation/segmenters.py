@@ -100,8 +100,8 @@ def segmented(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> RGBDFrame
         raise InputError(f"segmenter {name} failed on the frame ({_reason(error)}); check its package") from error
     if not isinstance(labels, np.ndarray):
         raise InputError(
-            f"segmenter {name} returned a {type(labels).__name__}; expected integers of shape {frame.depth.shape} "
-            "(rows, columns), 0 for the background, as a NumPy array"
+            f"segmenter {name} returned a value of type {type(labels).__name__}; expected integers of shape "
+            f"{frame.depth.shape} (rows, columns), 0 for the background, as a NumPy array"
         )
     with with_context(f"segmenter {name} returned invalid labels"):
         return dataclasses.replace(frame, labels=labels)

@@ -83,7 +83,7 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
     with decoding(f"poses: {path} is invalid", "JSON: frame name -> [4, 4] matrix, or a list of matrices"):
         stored = json.loads(content)
         if not isinstance(stored, (dict, list)):
-            raise TypeError(f"it contains a {type(stored).__name__}")
+            raise TypeError(f"it holds a value of type {type(stored).__name__}")
     if isinstance(stored, dict):
         if missing := [name for name in names if name not in stored]:
             raise InputError(f"poses: {path} has no pose of frame {missing[0]}; expected one for each frame")

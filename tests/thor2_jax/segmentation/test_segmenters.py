@@ -70,7 +70,7 @@ def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_segmenters_that_fail() -> None:
     for result, message in (
-        (None, "a NoneType"),
+        (None, "a value of type NoneType"),
         (np.zeros((6, 7), int), r"invalid labels: labels has shape \(6, 7\)"),
         (np.zeros((6, 8), bool), "invalid labels: labels has type bool"),
         (np.full((6, 8), -1), "invalid labels: labels has the value -1"),

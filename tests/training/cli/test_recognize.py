@@ -155,7 +155,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --segment sam --out out", "error: --segment is 'sam'; expected one of table, model"),
         ("frames --track --workers 2", "workers is 2"),
         ("frames --out out --track --poses poses", "error: --poses: poses is invalid"),
-        ("frames --out out --track --poses number.json", "it contains a int"),
+        ("frames --out out --track --poses number.json", "it holds a value of type int"),
         ("frames --out out --track --poses few.json", "few.json is 1; expected 2"),
         ("frames --out out --track --poses other.json", "no pose of frame two"),
         ("frames --out out --track --poses scaled.json", "frame two is not a rigid motion"),

@@ -88,7 +88,7 @@ POSES = "42/images/000000_poses.yaml"
         ("bop", "000049/scene_gt.json", {"1": [{"obj_id": True}, {"obj_id": 8}]}, "obj_id is True"),
         ("bop", "000049/scene_gt_info.json", {"1": [{"visib_fract": None}] * 2}, "visib_fract is None"),
         ("bop", "000049/scene_gt_info.json", {"1": [{"visib_fract": 1}]}, "1 instances, scene_gt.json 2"),
-        ("ocid", "names.json", "7", "holds a int"),
+        ("ocid", "names.json", "7", "holds a value of type int"),
         ("ocid", "names.json", {}, "lacks the sequences table/bottom/mixed/seq35, table/top/mixed/seq36"),
         ("ocid", "names.json", {"seq35": "mug"}, "seq35 is 'mug';"),
         ("ocid", "names.json", {"seq35": [""]}, "seq35 is [''];"),
