@@ -132,17 +132,16 @@ def multipart(files: Mapping[str, bytes]) -> tuple[str, bytes]:
     return request.headers["Content-Type"], request.read()
 
 
-_tls_context = functools.cache(ssl.create_default_context)  # slower than a request, and it cannot be pickled
-
-
 class _Connection:
     """Address of a service, and options of its requests."""
+
+    _tls_context = staticmethod(functools.cache(ssl.create_default_context))  # slower than a request, and not picklable
 
     def __init__(self, url: str, token: str | None = None, timeout: float = 30.0) -> None:
         """Create a client of the service at `url` with a bearer token and a timeout per request in seconds.
 
         Raises:
-            InputError: the token cannot be sent in a header.
+            InputError: the token cannot be sent in a header, or `url` is no text.
         """
         check_token(token)
         if not isinstance(url, str):
@@ -293,7 +292,7 @@ class Client(_Connection):
 
     def _send(self, method: str, path: str, parse: Callable[[httpx.Response], T], **body: Any) -> T:
         """Send a request with a body (content, files) and return what `parse` makes of its response."""
-        with self._no_answer_named(), httpx.Client(verify=_tls_context(), **self._options) as http:
+        with self._no_answer_named(), httpx.Client(verify=self._tls_context(), **self._options) as http:
             response = http.request(method, path, **body)
         return self._parsed(response, parse)
 
@@ -323,7 +322,7 @@ class AsyncClient(_Connection):
 
     async def _send(self, method: str, path: str, parse: Callable[[httpx.Response], T], **body: Any) -> T:
         with self._no_answer_named():
-            async with httpx.AsyncClient(verify=_tls_context(), **self._options) as http:
+            async with httpx.AsyncClient(verify=self._tls_context(), **self._options) as http:
                 response = await http.request(method, path, **body)
         return self._parsed(response, parse)
 
@@ -392,11 +391,10 @@ def _generation(response: httpx.Response) -> int:
 
 
 def _service_error(response: httpx.Response) -> ServiceError:
-    retry_after = response.headers.get("Retry-After", "")
+    retry_after = response.headers.get("Retry-After", "")  # in responses of proxies, it may be a date
     try:
         problem = response.json()
         field, message = problem["field"], str(problem["message"])
     except (ValueError, KeyError, TypeError):  # The response comes from a proxy, not from the service.
         field, message = None, response.reason_phrase
-    # In responses of proxies, Retry-After may be a date.
     return ServiceError(response.status_code, field, message, float(retry_after) if retry_after.isdecimal() else None)

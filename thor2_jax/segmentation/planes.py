@@ -42,8 +42,11 @@ LEAST_FILLING = 0.25
 PARALLEL, LARGEST_THING = 0.97, 0.15
 """Smallest cosine between the normals of a plane and of the tops of objects on it, and their largest height, metres."""
 
-LARGEST_TOP, TRAY_FILLING = 0.15, 0.5
-"""Largest connected area of such tops, square metres; a larger one that fills its hull to this fraction is a tray."""
+LARGEST_AREA = 0.15
+"""Largest area of an object, square metres."""
+
+TRAY_FILLING = 0.5
+"""Smallest fraction of its hull that a tray fills; a pile whose tops are connected fills less."""
 
 
 class DepthImage:
@@ -143,10 +146,7 @@ def dominant_planes(depth: DepthImage) -> list[Plane]:
         hull = np.asarray(cv2.convexHull(pixels), np.int32)[:, 0]
         filling = len(inliers) * points.step**2 / max(cv2.contourArea(hull), 1.0)
         extent, length = _extents(points, inliers)
-        grid = np.zeros(depth.z.shape, bool)[:: points.step, :: points.step]
-        grid[points.rows[inliers] // points.step, points.columns[inliers] // points.step] = True
-        connected = extent * length * components(grid)[1].max() / len(inliers)
-        is_tray = connected > LARGEST_TOP and filling > TRAY_FILLING
+        is_tray = filling > TRAY_FILLING and extent * length * _connected(points, inliers) > LARGEST_AREA
         tops = not is_tray and any(_is_just_above(plane.coefficients, coefficients) for plane in planes)
         if not tops and filling >= LEAST_FILLING and extent >= (LEAST_EXTENT if planes else LEAST_EXTENT_OF_LARGEST):
             planes.append(Plane(coefficients, hull, share, float(1 / np.median(points.inverse[inliers]))))
@@ -200,3 +200,11 @@ def _extents(points: _Points, inliers: NDArray[np.intp]) -> tuple[float, float]:
     positions = points.terms[inliers, :3] / points.inverse[inliers, None]
     _, width, length = np.sqrt(12 * np.linalg.eigvalsh(np.cov(positions.T)).clip(0))
     return float(width), float(length)
+
+
+def _connected(points: _Points, inliers: NDArray[np.intp]) -> float:
+    """Return the fraction of the points that lie in the largest connected part of the grid."""
+    rows, columns = points.rows[inliers] // points.step, points.columns[inliers] // points.step
+    grid = np.zeros((rows.max() + 1, columns.max() + 1), bool)
+    grid[rows, columns] = True
+    return float(components(grid)[1].max() / len(inliers))

@@ -15,7 +15,7 @@ from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.foreground import Evidence
 from thor2_jax.segmentation.pieces import find_pieces
 from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, watershed, window
-from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
+from thor2_jax.segmentation.planes import LARGEST_AREA, DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
 
@@ -29,8 +29,8 @@ MARGIN = 4
 """Margin around all objects, working pixels, in which their borders are moved; the rest of the image is background."""
 
 LEAST_PIXELS = 20
-LEAST_AREA, LARGEST_AREA = 2e-4, 0.15
-"""Smallest and largest area of an object, square metres."""
+LEAST_AREA = 2e-4
+"""Smallest area of an object, square metres."""
 
 LEAST_SUPPORT = 0.3
 """Smallest fraction of the pixels of an object that lie in the hull of a plane."""

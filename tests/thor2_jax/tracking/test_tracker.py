@@ -106,8 +106,8 @@ def test_poses_match_objects_of_a_camera_that_moved() -> None:
     assert [far.update(f, on_map)[0].track for f in below] == [1, 2]
 
 
-def test_poses_keep_a_camera_apart_from_a_row_of_equal_objects() -> None:
-    """When the camera moves on by two of them, each lies in the image where the second next was."""
+def test_poses_distinguish_equal_objects_in_a_row() -> None:
+    """The camera moves along the row by twice their distance, so that all images are equal."""
     tracker = Tracker(ToyRecognizer())
     for first in (0, 2, 4):
         pose = np.eye(4)
