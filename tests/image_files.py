@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import thor2_jax as thor2
 from thor2_jax.frames.frames import encode_image
+from thor2_jax.frames.prepared_instance import PreparedInstance, instance_cloud
 
 SAMPLES = Path(thor2.__file__).parent / "service" / "page" / "samples"
 """The sample frames of the service's page."""
@@ -114,3 +115,8 @@ def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path
         mask[window] = label
         color[window] = np.clip(np.array(FRAME_COLORS[name]) + rng.integers(-9, 10, (*mask[window].shape, 3)), 0, 255)
     return write_frame_files(directory, dataclasses.replace(tilted(mask), color=color), objects)
+
+
+def instance_clouds(frame: thor2.RGBDFrame) -> list[PreparedInstance]:
+    """Return the clouds of all instances in the order of `frame.instances`, including those that cannot be used."""
+    return [instance_cloud(frame, label) for label in frame.instances]

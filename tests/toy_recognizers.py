@@ -31,14 +31,14 @@ class UntaughtRecognizer:
         return Model(self.run, classifiers, Gallery("", trained=self.run.classes), self.unknown_below)
 
     def describe(self, frame: thor2.RGBDFrame) -> Any:
-        instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
+        instances = [SimpleNamespace(label=k, reason=None, occluded=False, points=[]) for k in frame.instances]
         return described(instances, instances)
 
 
-def described(instances: list[Any], content: Any) -> Any:
+def described(instances: list[Any], content: Any, overflow: int = 0) -> Any:
     """Return descriptors of instances, with what the toy recognizer reads."""
     usable = [instance for instance in instances if instance.reason is None]
-    oriented = SimpleNamespace(content=content, overflow=0)
+    oriented = SimpleNamespace(content=content, overflow=np.full(len(usable), overflow))
     return SimpleNamespace(instances=instances, usable=usable, oriented=oriented, packed=None)
 
 

@@ -221,7 +221,7 @@ class Client(_Connection):
         np.savez_compressed(
             body,
             points=np.concatenate(points),
-            colors=np.rint(255 * np.concatenate(colors)).astype(np.uint8),
+            colors=np.floor(255 * np.concatenate(colors) + 0.5).astype(np.uint8),  # halves up, as descriptors round
             sizes=np.array([len(xyz) for xyz in points]),
         )
         headers = {"Content-Type": "application/octet-stream"}

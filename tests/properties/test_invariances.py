@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from image_files import instance_clouds
 
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import PreparedInstance, instance_clouds, prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 
 from .conftest import NETWORK
 

@@ -261,7 +261,9 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
     """
     one_by_one = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
     distortion = next(filter(_is_given, (_entry(values, name) for name in _COEFFICIENTS)), one_by_one)
-    model = "fisheye" if values.get("fisheye_model") else _entry(values, "distortion_model", "model")  # of OpenCV
+    # fisheye_model is of OpenCV. Lenses with k4 and without k5 are fisheyes, too: the rational model has k4 to k6.
+    is_fisheye = values.get("fisheye_model") or (values.get("k4") and "k5" not in values)
+    model = "fisheye" if is_fisheye else _entry(values, "distortion_model", "model")
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
     if name not in _PINHOLE_MODELS and _is_given(distortion):
         raise InputError(

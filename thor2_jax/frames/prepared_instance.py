@@ -84,11 +84,6 @@ EMPTY_INSTANCE = PreparedInstance(0, np.zeros((0, 3), np.float32), np.zeros((0, 
 """An instance without points, which pads a batch."""
 
 
-def instance_clouds(frame: RGBDFrame) -> list[PreparedInstance]:
-    """Return the clouds of all instances in the order of `frame.instances`, including those that cannot be used."""
-    return [instance_cloud(frame, label) for label in frame.instances]
-
-
 def instance_cloud(frame: RGBDFrame, label: int) -> PreparedInstance:
     """Return the cloud of one instance, on a voxel grid of 3 mm and before `find_occlusion`.
 

@@ -27,7 +27,7 @@ from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import LOOKS
 from thor2_jax.model.model import Model
-from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
+from thor2_jax.model.recognition import Recognition, overflow_reason
 from thor2_jax.networks.networks import EMBEDDING
 from thor2_jax.surfaces.evidence import Sample, sample_points, with_evidence
 from thor2_jax.surfaces.surfaces import Surfaces
@@ -234,15 +234,10 @@ def answers(model: Model, instances: Sequence[PreparedInstance], inference: Infe
         overflow, n_points = int(inference.overflow[row]), len(instance.points)
         best = int(combined[row].argmax()) if names else -1
         confidence = float(combined[row, best]) if names else 0.0
-        reason = None
-        if overflow > MAX_OVERFLOW * n_points:
-            reason = (
-                f"overflow: {overflow} points and pairs of {n_points} points lie outside the descriptor's grid; check "
-                "the intrinsics and the depth scale; objects far larger than 40 cm do not fit"
-            )
-        elif not names:
+        reason = overflow_reason(overflow, n_points)
+        if reason is None and not names:
             reason = "unknown: no object is enrolled"
-        elif confidence < thresholds[best]:
+        elif reason is None and confidence < thresholds[best]:
             reason = f"unknown: a confidence of {confidence:.3f}, below {thresholds[best]:.3g}"
         top = {source: np.argsort(-of_all[row], kind="stable")[:N_TOP] for source, of_all in by_source.items()}
         result.append(

@@ -9,13 +9,13 @@ import numpy as np
 from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = [
-    "MAX_OVERFLOW",
     "AnswerBy",
     "Box",
     "Detection",
     "Recognition",
     "detections_as_json",
     "detections_of",
+    "overflow_reason",
 ]
 
 AnswerBy = Literal["classifiers", "gallery", "both"]
@@ -23,6 +23,16 @@ AnswerBy = Literal["classifiers", "gallery", "both"]
 
 MAX_OVERFLOW = 0.5
 """Largest overflow of an answer with a name, as a fraction of the points; beyond it, the descriptor misses too much."""
+
+
+def overflow_reason(overflow: int, n_points: int) -> str | None:
+    """Return why an instance with this overflow and number of points gets no name; None if it may get one."""
+    if overflow <= MAX_OVERFLOW * n_points:
+        return None
+    return (
+        f"overflow: {overflow} points and pairs of {n_points} points lie outside the descriptor's grid; check the "
+        "intrinsics and the depth scale; objects far larger than 40 cm do not fit"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,11 +104,9 @@ def detections_of(frame: RGBDFrame, recognitions: Sequence[Recognition]) -> list
         rows, columns = np.divmod(pixels, width)
         left, top = int(columns.min()), int(rows.min())
         box = Box(left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)
-        points, position = frame.points(pixels), None
+        points = frame.points(pixels)
         points = points[points[:, 2] > 0]
-        if len(points):
-            x, y, z = points.mean(axis=0).tolist()
-            position = (x, y, z)
+        position: Any = tuple(points.mean(axis=0).tolist()) if len(points) else None
         detections.append(Detection(recognition, box, position))
     return detections
 

@@ -28,7 +28,7 @@ from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, object_scores
 from thor2_jax.model.model import Model
-from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
+from thor2_jax.model.recognition import Recognition, overflow_reason
 from thor2_jax.tracking.matching import match, moved
 from thor2_jax.tracking.viewpoints import (
     NextView,
@@ -275,8 +275,7 @@ class Tracker:
         scores = object_scores(model, inference)
         for row, track in enumerate(tracks):
             track.overflow = int(inference.overflow[row])
-            fits = track.overflow <= MAX_OVERFLOW * len(track.instance.points)
-            weight = view_weight(track.instance) if fits else 0.0
+            weight = 0.0 if overflow_reason(track.overflow, len(track.instance.points)) else view_weight(track.instance)
             probabilities = {name: values[row] for name, values in inference.probabilities.items()}
             by_name = None if scores is None else dict(zip(model.gallery.names, scores[row].tolist(), strict=True))
             track.evidence.add(weight, probabilities, by_name)

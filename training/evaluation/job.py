@@ -19,6 +19,7 @@ import numpy as np
 
 from thor2_jax import DESCRIPTOR_VERSION, InputError, RGBDFrame
 from thor2_jax.files import check_output_directory, file_digest, locked, write_text
+from thor2_jax.model.recognition import overflow_reason
 from thor2_jax.printable import find_name
 from training.baselines.baseline import BaselineInputs
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
@@ -183,19 +184,19 @@ def _answer_first(load: Load, frames: LabelledFrames) -> FrameAnswers:
 def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction]:
     recognizer = runs[0].recognizer
     described = recognizer.describe(item.frame)
-    rows = {instance.label: row for row, instance in enumerate(described.usable)}
+    rows = {instance.label: (row, instance.occluded) for row, instance in enumerate(described.usable)}
     has_baselines = rows and any(run.baselines for run in runs)
     inputs = BaselineInputs.of_frame(described, recognizer.run.config, item.frame) if has_baselines else None
     values = [run.probabilities(item.identifier, described, inputs) for run in runs] if rows else []
-    reasons = {instance.label: instance.reason for instance in described.instances}
+    overflow = iter(described.oriented.overflow.tolist())  # of the usable instances
+    reasons = {i.label: i.reason or overflow_reason(next(overflow), len(i.points)) for i in described.instances}
     answers = []
     for label, name in sorted(item.truth.items()):
         truth, position = find_name(name, runs[0].classes) or name, _position(item.frame, label)
-        if (row := rows.get(label)) is None:
-            reason = reasons.get(label) or NO_PIXELS
+        if (reason := reasons.get(label, NO_PIXELS)) is not None:
             answers.append(InstancePrediction(label, truth, reason=reason, position=position))
         else:
-            occluded = described.usable[row].occluded
+            row, occluded = rows[label]
             probabilities = np.stack([values[index][name][row] for index, name in all_predictors(runs)])  # [M, C]
             answers.append(InstancePrediction(label, truth, occluded, None, probabilities, position))
     return answers

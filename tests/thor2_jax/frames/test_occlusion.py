@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from image_files import instance_clouds
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.frames.prepared_instance import PreparedInstance, find_occlusion, instance_clouds
+from thor2_jax.frames.prepared_instance import PreparedInstance, find_occlusion
 
 CAMERA = Intrinsics(300.0, 300.0, 79.5, 59.5)
 BACK, FRONT = 1, 2

@@ -6,13 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from image_files import instance_clouds
 from refusals import assert_refused
 from scipy import ndimage
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
-from thor2_jax.frames.prepared_instance import PreparedInstance, instance_clouds, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from training.readers.frames import FrameFolder
 
 HEIGHT, WIDTH = 240, 320

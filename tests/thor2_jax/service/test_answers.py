@@ -97,6 +97,7 @@ def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
     empty = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     one_point = np.ones((1, 3), np.float32), np.zeros((1, 3), np.uint8)
     far_apart = np.array([[-100, 0, 0], [100, 0, 0], [0, 100, 1e-30]], np.float32), np.zeros((3, 3), np.uint8)
+    check_described(server, [(xyz, np.full(xyz.shape, 2.5 / 255)) for xyz, _ in inputs[:1]])  # halfway between levels
     degenerate = Client(server.url, timeout=HANG).describe([empty, one_point, far_apart])
     assert not degenerate.tops2[0].any() and np.isfinite(degenerate.tops2).all()
     for cloud in ({"points": [], "colors": []}, {"points": [[1, 0.5, 0]], "colors": [[255.0, 0, 1]]}):

@@ -268,7 +268,7 @@ def test_every_labelled_instance_gets_an_answer() -> None:
     tops = [[0.6, 0.3, 0.1], [0.5, 0.4, 0.1], [0.2, 0.7, 0.1], [1, 0, 0]]
     tops2 = [[0.1, 0.7, 0.2], [0.1, 0.1, 0.8], [0.3, 0.4, 0.3], [1, 0, 0]]
     lost = dict.fromkeys((9, 11), "too few points")
-    instances = [SimpleNamespace(label=k, reason=lost.get(k), occluded=k == 4) for k in (2, 4, 7, 9, 11)]
+    instances = [SimpleNamespace(label=k, reason=lost.get(k), occluded=k == 4, points=[1]) for k in (2, 4, 7, 9, 11)]
     recognizer: Any = UntaughtRecognizer(("mug", "bowl", "can"), ("tops", "tops2"))
     recognizer.describe = lambda _: described(instances, {"tops": np.array(tops), "tops2": np.array(tops2)})
     recognizer.probabilities = lambda table: table
@@ -281,6 +281,9 @@ def test_every_labelled_instance_gets_an_answer() -> None:
     probabilities = [i.probabilities for i in answers.instances]
     np.testing.assert_allclose(probabilities[:3], np.stack([tops, tops2], axis=1)[:3], rtol=1e-6)
     assert probabilities[3:] == [None] * 3
+    recognizer.describe = lambda _: described(instances, {"tops": np.array(tops), "tops2": np.array(tops2)}, overflow=1)
+    (answers,) = answer_frames([Run("run", "", recognizer)], [frame])  # recognition gives none of these a name
+    assert [i.probabilities for i in answers.instances] == [None] * 6 and "overflow" in str(answers.instances[0].reason)
     recognizer.describe, recognizer.probabilities = lambda _: described(instances[3:], {}), None  # is not called
     (answers,) = answer_frames([Run("run", "", recognizer)], [frame])
     assert [i.probabilities for i in answers.instances] == [None] * 6
