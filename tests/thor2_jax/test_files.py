@@ -154,6 +154,7 @@ def test_shared_and_nested_yaml_values_are_read() -> None:
     assert files.parse_yaml(b"a: &row [1, 2]\nb: *row\n") == {"a": [1, 2], "b": [1, 2]}
     assert files.parse_yaml(b"[" * 50 + b"]" * 50) is not None
     assert files.parse_yaml(b"") is None
+    assert files.parse_yaml(b"{000010: 0o10, 12: 0x10, 08: -3}") == {10: "0o10", 12: 16, "08": -3}  # none is octal
 
 
 @pytest.mark.parametrize(

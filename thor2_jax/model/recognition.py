@@ -102,8 +102,7 @@ def detections_of(frame: RGBDFrame, recognitions: Sequence[Recognition]) -> list
     for recognition in recognitions:
         pixels = frame.instance_pixels[recognition.label]
         rows, columns = np.divmod(pixels, width)
-        left, top = int(columns.min()), int(rows.min())
-        box = Box(left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)
+        box = Box(int(columns.min()), int(rows.min()), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1)
         points = frame.points(pixels)
         points = points[points[:, 2] > 0]
         position: Any = tuple(points.mean(axis=0).tolist()) if len(points) else None
