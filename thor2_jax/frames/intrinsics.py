@@ -62,7 +62,7 @@ _PINHOLE = ("fx", "fy", "cx", "cy")
 _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
 """Distortion models with OpenCV's coefficients; other models are refused unless all coefficients are 0."""
 
-_COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs", "dist_coeff", "dist")
+_COEFFICIENTS = "distortion distortion_coefficients distortion_coeffs D d coeffs distCoeffs dist_coeffs dist_coeff dist"
 _MESSAGE_FIELDS = ("width", "height", "distortion_model", "D", "d", "K", "k")
 
 Array = NDArray[np.floating[Any]]
@@ -260,7 +260,7 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
         InputError: the distortion model is not supported and a coefficient is not 0.
     """
     one_by_one = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
-    distortion = next(filter(_is_given, (_entry(values, name) for name in _COEFFICIENTS)), one_by_one)
+    distortion = next(filter(_is_given, (_entry(values, name) for name in _COEFFICIENTS.split())), one_by_one)
     # fisheye_model is of OpenCV. Lenses with k4 and without k5 are fisheyes, too: the rational model has k4 to k6.
     is_fisheye = values.get("fisheye_model") or (values.get("k4") and "k5" not in values)
     model = "fisheye" if is_fisheye else _entry(values, "distortion_model", "model")
