@@ -311,7 +311,7 @@ def _pinhole_matrix(values: Mapping[Any, Any], column: str, row: str) -> list[An
     missing = [name for name in names if name not in values]
     if missing:
         raise InputError(f"intrinsics lacks {', '.join(missing)}; expected {', '.join(names)}")
-    return [values["fx"], 0, values[column], 0, values["fy"], values[row], 0, 0, 1]
+    return [values["fx"], values.get("skew", 0), values[column], 0, values["fy"], values[row], 0, 0, 1]
 
 
 def _units_per_metre(scale: Any, units: int, most: float, expected: str) -> float | None:

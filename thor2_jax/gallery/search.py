@@ -51,7 +51,9 @@ class ExactSearch:
         self._embeddings = embeddings.astype(np.float32) if len(embeddings) <= FAST_VIEWS else embeddings
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """Return similarities and indices [Q, min(count, N)] of the nearest views, the nearest first, ties by index.
+        """Return similarities and indices [Q, min(count, N)] of the nearest views, the nearest first.
+
+        Views of equal similarity are in the order of their indices; if not all of them fit, any may be left out.
 
         Args:
             queries: [Q, D] of unit length.
@@ -70,7 +72,7 @@ class ExactSearch:
 
 
 def _largest(values: NDArray[np.float32], count: int) -> NDArray[np.intp]:
-    """Return the indices [Q, min(count, N)] of the largest values [Q, N], the largest first, ties by index."""
+    """Return the indices [Q, min(count, N)] of the largest values [Q, N], the largest first, equal ones by index."""
     count = min(count, values.shape[1])
     chosen = np.sort(np.argpartition(-values, count - 1, axis=1)[:, :count], axis=1)
     order = np.argsort(-np.take_along_axis(values, chosen, axis=1), axis=1, kind="stable")

@@ -126,6 +126,7 @@ def test_coefficients_one_by_one() -> None:
     """This is how the software of Azure Kinect and Orbbec lists them."""
     named = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), DISTORTIONS["rational_polynomial"], strict=True))
     assert Intrinsics.of(PINHOLE | named).distortion == DISTORTIONS["rational_polynomial"]
+    assert_refused("3 x 3 matrix", Intrinsics.of, PINHOLE | {"skew": 0.5})
     assert_refused("model fisheye", Intrinsics.of, PINHOLE | {"k1": 0.1, "k2": -0.05, "k3": 0.02, "k4": -0.01})
 
 
