@@ -154,7 +154,7 @@ def _answer_section(report: Mapping[str, Any], out: Path) -> Section:
         caption = f"{truth}, recognized as {name}: frame {pair['frame']}, label {pair['label']}"
         shown.append(Picture(f"confusions/{k}.jpg", caption, "small"))
     text = " ".join(answer_texts(report)[:2])
-    text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
+    text += " The most frequent wrong names, each with its most confident instance:" * bool(rows)
     draw_confusion(np.array(report["confusion"]), report["classes"], report["main"], out / "confusion.png")
     caption = f"Confusion matrix of {report['main']} without rejection, of objects that occur, summed over models."
     matrix = Section("Confusion matrix of the known objects", pictures=[Picture("confusion.png", caption)])
