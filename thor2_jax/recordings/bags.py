@@ -124,7 +124,7 @@ class Bag:
                 # rosbags would expand YAML aliases without a limit, and could not close invalid values of "files".
                 files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
                 if not isinstance(files, list | None):
-                    raise ValueError("files of metadata.yaml is no list")
+                    raise ValueError("files of metadata.yaml is not a list")
             self.is_truncated = self.path.suffix == ".mcap" and _is_truncated(self.path)
             # ROS's image definitions are used, which have not changed; rosbags would compile those of the file.
             if self.path.suffix == ".bag":
