@@ -138,11 +138,6 @@ class _Connection:
     _tls_context = staticmethod(functools.cache(ssl.create_default_context))  # slower than a request, and not picklable
 
     def __init__(self, url: str, token: str | None = None, timeout: float = 30.0) -> None:
-        """Create a client of the service at `url` with a bearer token and a timeout per request in seconds.
-
-        Raises:
-            InputError: the token cannot be sent in a header, or `url` is no text.
-        """
         check_token(token)
         if not isinstance(url, str):
             raise InputError(f"url is of type {type(url).__name__}; expected text, such as http://localhost:8080")
@@ -169,7 +164,11 @@ class _Connection:
 
 
 class Client(_Connection):
-    """Client of one service. It keeps no connection open and is thread-safe."""
+    """Client of the service at `url`, with a bearer token and a timeout per request in seconds.
+
+    It keeps no connection open and is thread-safe. It raises InputError if `url` is not text or the token cannot be
+    sent in a header.
+    """
 
     def recognize(
         self, *, color: File, depth: File, labels: File | NDArray[Any] | None = None, intrinsics: Any

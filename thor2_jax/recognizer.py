@@ -93,7 +93,7 @@ class Recognizer:
     """A model and its enrolled objects on disk, ready to recognize the objects of a frame.
 
     Attributes:
-        objects: the enrolled objects, on disk after `load`.
+        objects: the enrolled objects, an `ObjectGallery`; on disk after `load`.
         chunk: number of instances that are described and classified in one call. While the device computes a chunk, the
             host prepares the next one. Larger chunks need fewer compiled functions, but make each frame slower.
 

@@ -75,7 +75,7 @@ def enroll_objects(
     model = model.resolve()
     is_new = _is_empty(model)
     if is_new and gallery is not None:
-        raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
+        raise InputError(f"gallery is {gallery}, and {model} is not a run directory; give one, or leave out gallery")
     added: dict[str, GalleryObject] = {}
     notes: list[str] = []
     with contextlib.ExitStack() as stack:

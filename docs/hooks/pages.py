@@ -142,34 +142,52 @@ def _text(text: str) -> str:
 
 
 def openapi() -> dict[str, Any]:
-    """Return the OpenAPI description of a service with `--teach`."""
+    """Return the OpenAPI description of a service with `--teach` and a token."""
     from thor2_jax.service.app import create_app
     from thor2_jax.service.settings import Settings
 
     with tempfile.TemporaryDirectory() as directory:
         run = Path(directory) / "run"
         save_run(TrainedRun(DescriptorConfig(), colornet.load_default(), (), {}, {}), run)
-        return create_app(Settings(run, teach=True)).openapi()
+        return create_app(Settings(run, teach=True, token="...")).openapi()
 
 
 def http_page(schema: dict[str, Any]) -> str:
-    """Return the page of all requests, with their form fields and statuses."""
+    """Return the page of all requests with their form fields, of the statuses, and of the fields of all answers."""
     lines = [
         "# HTTP",
         "",
         "The requests of `thor2 serve --teach`, generated from the code. [openapi.json](openapi.json) describes them "
         "for programs; [the service](../service.md) explains them.",
     ]
+    meanings: dict[str, str] = {}
     for path, methods in sorted(schema["paths"].items()):
         for method, operation in methods.items():
             lines += ["", f"## {method.upper()} {path}", "", operation.get("description", operation.get("summary", ""))]
-            content = operation.get("requestBody", {}).get("content", {})
-            for kind, body in content.items():
-                lines += ["", f"Body: `{kind}`", ""]
-                required = body["schema"].get("required", [])
-                for name, field in body["schema"].get("properties", {}).items():
-                    note = " (required)" if name in required else ""
-                    lines.append(f"- `{name}`{note}: {_text(field.get('description', field.get('type', '')))}")
-            lines += ["", "| status | meaning |", "|---|---|"]
-            lines += [f"| {code} | {_text(answer['description'])} |" for code, answer in operation["responses"].items()]
+            for kind, body in operation.get("requestBody", {}).get("content", {}).items():
+                lines += ["", f"Body: `{kind}`", "", *_fields(body["schema"])]
+            answers = operation["responses"]
+            links = _links(answers.pop("200")) or "text"
+            meanings |= {code: answer["description"] for code, answer in answers.items()}
+            lines += ["", f"Answer: {links}. Errors: {', '.join(sorted(answers))}."]
+    lines += ["", "## Statuses", "", "| status | meaning |", "|---|---|"]
+    lines += [f"| {code} | {_text(meaning)} |" for code, meaning in sorted(meanings.items())]
+    lines += ["", "## Fields of the answers", "", "An error has the fields of [Problem](#problem)."]
+    for name, record in sorted(schema["components"]["schemas"].items()):
+        lines += ["", f"### {name}", "", record.get("description", ""), "", *_fields(record)]
     return "\n".join(lines) + "\n"
+
+
+def _fields(record: dict[str, Any]) -> list[str]:
+    fields = record.get("properties", {})
+    optional = {name: "" if name in record.get("required", ()) else " (optional)" for name in fields}
+    return [
+        f"- `{name}`{optional[name]}: {_text(field.get('description', ''))} {_links(field)}".rstrip(": ")
+        for name, field in fields.items()
+    ]
+
+
+def _links(value: Any) -> str:
+    """Return links to the records in a part of the OpenAPI description."""
+    names = re.findall(r"#/components/schemas/(\w+)", json.dumps(value))
+    return ", ".join(f"[{name}](#{name.lower()})" for name in names)

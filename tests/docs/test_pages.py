@@ -125,22 +125,35 @@ QUESTIONS = {
 """Search text of a user -> page that is found first."""
 
 
-@pytest.mark.slow
-def test_questions_find_their_page_first(browser: Browser, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("mkdocs", reason="mkdocs is not installed (extra docs)")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    path = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(path)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=HANG)
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
+    return path
+
+
+@pytest.mark.slow
+def test_reference_has_constructors_and_fields_of_answers(site: Path) -> None:
+    python, requests = [(site / "reference" / f"{name}.html").read_text("utf-8") for name in ("python", "http")]
+    assert re.search(r"Recognizer\(\s*run: TrainedRun,\s*unknown_below", re.sub("<[^>]+>", "", python))
+    assert 'id="frameanswer"' in requests and requests.count("<td>401</td>") == 1
+
+
+@pytest.mark.slow
+def test_questions_find_their_page_first(browser: Browser, site: Path) -> None:
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(site))
     page, first = browser.new_page(), {}
     page.set_default_timeout(1000 * HANG)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()  # ends with a failing test
-        site = f"http://127.0.0.1:{server.server_port}/"
+        address = f"http://127.0.0.1:{server.server_port}/"
         for question in QUESTIONS:
-            page.goto(f"{site}index.html?q={question}")
+            page.goto(f"{address}index.html?q={question}")
             link = page.locator(".md-search-result__item a.md-search-result__link").first.get_attribute("href") or ""
-            first[question] = link.partition("?")[0].partition("#")[0].removeprefix(site).removesuffix(".html")
+            first[question] = link.partition("?")[0].partition("#")[0].removeprefix(address).removesuffix(".html")
         server.shutdown()
     page.close()
     assert first == QUESTIONS

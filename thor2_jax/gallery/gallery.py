@@ -1,4 +1,4 @@
-"""The gallery: embedded views of enrolled objects beside the trained classes, and their scores for unknown instances.
+"""The gallery: embedded views of enrolled objects beside the trained classes, and their scores for instances.
 
 The views are kept as compact clouds with a few bytes per point, from which any embedding can be computed again.
 

@@ -112,7 +112,7 @@ def check_index(directory: Path) -> None:
     """Raise GalleryError if the path, or `objects` in it, is not a directory, or if it has objects but no index."""
     for path in (directory, directory / "objects"):
         if path.exists() and not path.is_dir():
-            raise GalleryError(f"gallery: {path} is no directory; expected that of a gallery; choose another one")
+            raise GalleryError(f"gallery: {path} is not a directory; expected that of a gallery; choose another one")
     if gallery_stamp(directory) is None and any(_own_objects(directory)):
         raise _unusable(directory, f"{directory} has objects, but no {INDEX_FILE}", "rebuild it")
 
@@ -236,7 +236,7 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
         )
         return about.get("name"), _with_origin(enrolled, about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
+        raise GalleryError(f"gallery: {path} is not an object of a gallery ({error})") from None
 
 
 def update_gallery(

@@ -1,8 +1,8 @@
 """Frames from ROS 1, ROS 2 and MCAP recordings: pairs of colour and depth images nearest in time (extra `bags`).
 
-with Bag("table.mcap") as bag:
-    for recorded in bag.frames():
-        frame = segmented(recorded.read())
+    with Bag("table.mcap") as bag:
+        for recorded in bag.frames():
+            frame = segmented(recorded.read())
 
 Recordings are not trusted: ten kilobytes of their compressed parts can decompress to gigabytes. The end of an MCAP file
 may be missing. Such a file is a sequence of records: a byte for the kind, the length in eight bytes, and the content.
@@ -56,10 +56,10 @@ class Bag:
     Attributes:
         path: the file, or the directory of a ROS 2 bag.
         topics: the topics that are read.
-        intrinsics: intrinsics of the colour camera.
         frame_id: coordinate frame of the colour images.
         counts: numbers of images and pairs so far.
         is_truncated: whether the end of the recording is missing; complete frames of an MCAP file are read anyway.
+        intrinsics: intrinsics of the colour camera.
         notes: warnings about likely mistakes in the recording.
     """
 
@@ -124,7 +124,7 @@ class Bag:
                 # rosbags would expand YAML aliases without a limit, and could not close invalid values of "files".
                 files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
                 if not isinstance(files, list | None):
-                    raise ValueError("files of metadata.yaml is no list")
+                    raise ValueError("files of metadata.yaml is not a list")
             self.is_truncated = self.path.suffix == ".mcap" and _is_truncated(self.path)
             # ROS's image definitions are used, which have not changed; rosbags would compile those of the file.
             if self.path.suffix == ".bag":

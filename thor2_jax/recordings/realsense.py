@@ -1,8 +1,10 @@
 """Frames of a RealSense camera (extra `realsense`).
 
-with RealSenseCamera() as camera:
-    for recorded in camera.frames():
-        frame = segmented(recorded.read())
+    with RealSenseCamera() as camera:
+        for recorded in camera.frames():
+            frame = segmented(recorded.read())
+
+Frames have no labels; `segmented` adds them.
 """
 
 import contextlib

@@ -260,7 +260,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
             known = await service.change(lambda objects: objects.undo(files["generation"]), 409, "generation", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 
-    @routes.delete("/v1/objects/{name:any}", responses=GALLERY_ERRORS | error_responses(404))
+    @routes.delete("/v1/objects/{name:any}", responses=GALLERY_ERRORS | error_responses(404, 408, 413, 422))
     async def forget(request: Request, name: str) -> schemas.ChangeAnswer:
         """Forget an object: remove its views; a trained class is no longer predicted."""
         async with service.admit(request, read_body) as (admitted, _):

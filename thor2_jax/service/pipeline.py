@@ -266,7 +266,7 @@ class Service:
         self.engine.refresh()
         needed = self.engine.explanation_programs(len(prepared.instances[0].points))
         if not all([self._compile_explanations(programs).done() for programs in needed]):
-            message = "Explanations are still being compiled, which takes up to some minutes."
+            message = "Explanations are still being compiled, which can take some minutes."
             raise RequestError(503, None, message, WHY_RETRY_SECONDS)
 
         def explained() -> WhyAnswer:

@@ -27,5 +27,5 @@ def colornet(
     console.print(
         f"{network.n_raw_nodes} raw nodes, {network.n_regions} regions, {len(network.edges)} edges; "
         f"{'equal to' if same else 'DIFFERENT from'} the packaged network; "
-        f"written to {out}; use it with: ColorNetwork.load({str(out / 'network.npz')!r})"
+        f"written to {out}; use it with: colornet.load({str(out / 'network.npz')!r})"
     )

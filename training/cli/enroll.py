@@ -31,7 +31,7 @@ class EnrollOptions:
 def enroll(
     *,
     model: Annotated[Path, typer.Option(help="Run directory; created if it does not exist.")],
-    name: Annotated[str | None, typer.Argument(help="Name of the object. Default: enroll every object.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of the object. Default: all.")] = None,
     given: options.FrameOptions,
     mesh: Annotated[
         Path | None, typer.Option(help="Mesh of the object (GLB, OBJ, PLY), its folder, or a folder of objects.")

@@ -19,8 +19,8 @@ evaluate_app = typer.Typer(
 )
 app.add_typer(evaluate_app, name="evaluate")
 
-DatasetArgument = Annotated[Path, typer.Argument(help="Folder of the dataset.")]
-MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", help="Further run directories.")]
+DatasetArgument = Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of the dataset.")]
+MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="RUN", help="Further run directories.")]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

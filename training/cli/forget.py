@@ -10,7 +10,7 @@ from training.cli.app import app, finish, option_arguments
 
 @app.command()
 def forget(
-    name: Annotated[str, typer.Argument(help="Name of an enrolled object or of a trained class.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Enrolled object or trained class.")],
     model: options.ModelOption,
     gallery: options.GalleryOption = None,
 ) -> None:

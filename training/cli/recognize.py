@@ -151,8 +151,9 @@ class _Answers:
         notes = sys.stderr if self._as_json else None
         if self._has_unknown:
             print(escape_characters(known), file=notes)
-        result = f"written to {self._written}" if self._written else f"frames recognized: {len(self.failures)}"
-        finish(result, "see why", *command, file=notes, **options)
+        if self.failures or not self._failed:
+            result = f"written to {self._written}" if self._written else f"frames recognized: {len(self.failures)}"
+            finish(result, "see why", *command, file=notes, **options)
         if self._tables.n_without_number:
             print_note(f"instances whose name has no number in {self._given.names}: {self._tables.n_without_number}")
         if self._failed:

@@ -153,13 +153,12 @@ def _answer_section(report: Mapping[str, Any], out: Path) -> Section:
         rows.append([truth, name, f"{pair['count']}", f"{pair['share']:.0%}"])
         caption = f"{truth}, recognized as {name}: frame {pair['frame']}, label {pair['label']}"
         shown.append(Picture(f"confusions/{k}.jpg", caption, "small"))
-    text = " ".join(answer_texts(report)[:2])
-    text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
+    texts = answer_texts(report)[:2] + ["Most frequent wrong names, with the most confident instance:"] * bool(rows)
     draw_confusion(np.array(report["confusion"]), report["classes"], report["main"], out / "confusion.png")
     caption = f"Confusion matrix of {report['main']} without rejection, of objects that occur, summed over models."
     matrix = Section("Confusion matrix of the known objects", pictures=[Picture("confusion.png", caption)])
     header = ["object", "recognized as", "count", "fraction of the object's instances"]
-    return Section("Answers", text, (header, rows) if rows else None, shown, matrix)
+    return Section("Answers", " ".join(texts), (header, rows) if rows else None, shown, matrix)
 
 
 def _accuracy_sections(report: Mapping[str, Any], out: Path) -> list[Section]:

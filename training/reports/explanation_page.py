@@ -163,8 +163,8 @@ def _advice(explanation: Explanation) -> str:
 
 def _changes_text(explanation: Explanation) -> str:
     scores = explanation.scores.of_instances([explanation.instance])[0]
-    kinds = {"color": "A shift of all colours by", "extent": "A change of the side lengths by"}
-    sentences = [f"{kinds[c.kind]} {change_text(c)} makes {c.answer} most probable." for c in explanation.changes]
+    kinds = {"color": "A shift of all colours", "extent": "A change of the side lengths"}
+    sentences = [f"{kinds[c.kind]} ({change_text(c)}) makes {c.answer} most probable." for c in explanation.changes]
     if explanation.scores.names[scores.argmax()] != explanation.name:
         decided = "the surfaces of the objects, or classifiers and gallery together, decided"
         sentences.insert(0, f"The explained scores alone would give {explanation.runner_up}; {decided}.")

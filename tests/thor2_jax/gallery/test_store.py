@@ -107,7 +107,7 @@ def test_what_is_loaded_is_what_was_stored(directory: Path, monkeypatch: pytest.
 def test_a_file_is_no_gallery(tmp_path: Path) -> None:
     for name, gallery in (("gallery", tmp_path / "gallery"), ("objects", tmp_path)):
         (tmp_path / name).write_text("mine")
-        with pytest.raises(GalleryError, match=f"{name} is no directory"):
+        with pytest.raises(GalleryError, match=f"{name} is not a directory"):
             check_index(gallery)
 
 

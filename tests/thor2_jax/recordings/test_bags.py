@@ -178,7 +178,7 @@ MANY_ALIASES = [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(
     ("pattern", "replacement", "message"),
     [
         *((f"name: {COLOR}", f"name: {value}", "damaged") for value in ("[x]", "5", "*a11")),
-        (r"(?s)  files:.*?(?=\n  \w)", "  files: x", "no list"),
+        (r"(?s)  files:.*?(?=\n  \w)", "  files: x", "not a list"),
     ],
 )
 def test_damaged_metadata(tmp_path: Path, pattern: str, replacement: str, message: str) -> None:

@@ -106,6 +106,7 @@ def test_version_and_help(printed: Command, monkeypatch: pytest.MonkeyPatch) -> 
         text = printed(*arguments)
         assert "Usage:" in text and "…" not in text, arguments
     assert "--install-completion" in printed("--help")
+    assert "[NAME] [FRAME]..." in printed("enroll", "--help") and "[[" not in printed("evaluate", "uwis", "--help")
     assert "{" not in printed("train", "--help")  # values of the protocols are filled in
 
 

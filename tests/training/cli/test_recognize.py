@@ -51,6 +51,13 @@ def test_a_frame_that_fails_has_no_earlier_answer(model: Path, tmp_path: Path, r
     assert "depth.png" in refused(*command) and not list(out.iterdir())
 
 
+def test_no_explanation_is_advised_if_every_frame_fails(model: Path, tmp_path: Path, texts: Texts) -> None:
+    folder = write_frame_files(tmp_path / "frames" / "1", small_frame())
+    (folder / "depth.png").write_bytes(b"damaged")
+    out, err = texts("recognize", "--model", model, tmp_path / "frames", status=2)
+    assert "explain" not in out + err and "1 of 1 frames" in err
+
+
 def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, texts: Texts) -> None:
     for number in range(1, 7):
         write_frame_files(tmp_path / "frames" / f"00000{number}", small_frame(number))
