@@ -254,18 +254,29 @@ def main() -> None:
         if package not in TRAINING_PACKAGES:
             raise
         _exit_with(f"{package} is not installed; this command needs it, recognition does not: see docs/install.md")
-    except RuntimeError as error:
-        if "Symlink loop" not in str(error):  # of Path.resolve
+    except (AssertionError, InputError, OSError, RuntimeError) as error:
+        _check_platforms()
+        if not isinstance(error, (InputError, OSError)) and "Symlink loop" not in str(error):  # of Path.resolve
             raise
-        _exit_with(str(error))
-    except (InputError, OSError) as error:
         _exit_with(_with_options(reason_of(error)))
     finally:
         sys.unraisablehook = report
         for number, handler in previous.items():
             if signal.signal(number, handler) is signal.SIG_DFL:
                 signal.raise_signal(number)
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # Python would show an exception during its exit
     raise SystemExit(status)
+
+
+def _check_platforms() -> None:
+    """End this process if JAX cannot start with JAX_PLATFORMS, which seems to damage whatever file is read first."""
+    if (platforms := os.environ.get("JAX_PLATFORMS")) and "jax" in sys.modules:
+        try:
+            sys.modules["jax"].devices()
+        except Exception as error:
+            expected = "expected platforms of this machine, such as cpu"
+            _exit_with(f"JAX_PLATFORMS is {platforms} ({reason_of(error)}); {expected}")
 
 
 def _with_options(message: str) -> str:

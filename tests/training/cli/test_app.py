@@ -210,6 +210,33 @@ sys.modules["training.cli.app"].main()
     assert not os.listdir(tmp_path)
 
 
+def test_a_second_ctrl_c_ends_the_exit_without_a_traceback() -> None:
+    code = """
+import atexit, signal, sys
+import training.cli
+signal.signal(signal.SIGINT, signal.default_int_handler)  # in a background job, it is ignored
+sys.modules["training.cli.app"].app = lambda **_: atexit.register(signal.raise_signal, signal.SIGINT) and 130
+sys.modules["training.cli.app"].main()
+"""
+    done = run_python("-c", code)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+@pytest.mark.parametrize(
+    "error", [AssertionError(), RuntimeError("no backend"), thor2.InputError("embedding: damaged")]
+)
+def test_platforms_that_jax_lacks_are_named(
+    error: Exception, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(**_: object) -> None:
+        raise error
+
+    monkeypatch.setenv("JAX_PLATFORMS", "absent")
+    monkeypatch.setattr("jax.devices", fail)
+    monkeypatch.setattr(sys.modules["training.cli.app"], "app", fail)
+    assert "JAX_PLATFORMS is absent" in refused("demo")
+
+
 class Finalized:
     """An object whose finalizer is interrupted."""
 
