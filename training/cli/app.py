@@ -66,7 +66,8 @@ def show_progress(quiet: bool = False, *, prints: bool = False) -> AbstractConte
     """
     if quiet:
         return contextlib.nullcontext(lambda stage, done, total, note: None)
-    return contextlib.nullcontext(_lines()) if prints or not sys.stderr.isatty() else _bars()
+    has_bars = not prints and sys.stderr.isatty() and not Console(stderr=True).is_dumb_terminal
+    return _bars() if has_bars else contextlib.nullcontext(_lines())
 
 
 @contextlib.contextmanager
