@@ -172,11 +172,8 @@ MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
 
 def option_arguments(**values: object) -> list[str]:
     """Return the command-line options with these values, in their order; None leaves an option out, True is a flag."""
-    words: list[str] = []
-    for name, value in values.items():
-        if value is not None:
-            words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
-    return words
+    given = {f"--{name.replace('_', '-')}": value for name, value in values.items() if value is not None}
+    return [word for name, value in given.items() for word in ([name] if value is True else [name, str(value)])]
 
 
 def finish(result: str, purpose: str, *command: object, file: TextIO | None = None, **options: object) -> None:
@@ -276,8 +273,7 @@ def _check_platforms() -> None:
         try:
             sys.modules["jax"].devices()
         except Exception as error:
-            expected = "expected platforms of this machine, such as cpu"
-            _exit_with(f"JAX_PLATFORMS is {platforms} ({reason_of(error)}); {expected}")
+            _exit_with(f"JAX_PLATFORMS is {platforms} ({reason_of(error)}); expected one of this machine, such as cpu")
 
 
 def _with_options(message: str) -> str:
