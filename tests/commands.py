@@ -1,6 +1,7 @@
 """The command line in this process: its arguments and its output."""
 
 import json
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +31,8 @@ def run_thor2(*arguments: object) -> int:
             cli.main()
         except SystemExit as stop:
             return int(stop.code or 0)
+        finally:
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # see `tests/conftest.py`
     return 0
 
 

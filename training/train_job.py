@@ -107,6 +107,7 @@ def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedR
         _check_views(job, directory, views)
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
+        remove_leftovers(directory)  # a process may have been killed while it removed the checkpoints
         if job.sequences is not None:
             shown = numbered(add_prefix(progress, str(directory.relative_to(job.out))), job.stages)
         runs[directory] = [] if is_finished(directory) else train_run(views, directory, job.protocol, shown, enrolled)

@@ -12,6 +12,7 @@ import os
 import signal
 import socket
 import tempfile
+from multiprocessing.util import get_temp_dir
 
 import uvicorn
 from fastapi import FastAPI
@@ -97,7 +98,8 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         else:
             log.info("listening at %s; requests wait until a worker is ready", url)
             listener.set_inheritable(True)
-            with tempfile.TemporaryDirectory() as directory:
+            # Workers inherit the directory of this process for sockets, which they leave, since they end by a signal.
+            with tempfile.TemporaryDirectory(dir=get_temp_dir()) as directory:
                 os.environ["PROMETHEUS_MULTIPROC_DIR"] = directory
                 _Supervisor(config, [listener]).run()
 

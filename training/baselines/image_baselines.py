@@ -184,8 +184,7 @@ def _backbone(task: FitTask) -> tuple[int, nnx.Module, Mapping[str, str]]:
         network = architecture.build(1, 0)
         return 0, network.color, architecture.load_weights(network, task.weights)
     for number, name in enumerate(TRAINED, 1):
-        file = baseline_file(task.directory, name)
-        if file.is_file():
+        if (file := baseline_file(task.directory, name)).is_file():
             stored = StoredBaseline.read(file, task.source.classes)
             network = model_from_arrays(partial(ARCHITECTURES[name].build, len(task.source.classes), 0), stored.arrays)
             return number, network.color, stored.weights

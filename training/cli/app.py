@@ -66,7 +66,8 @@ def show_progress(quiet: bool = False, *, prints: bool = False) -> AbstractConte
     """
     if quiet:
         return contextlib.nullcontext(lambda stage, done, total, note: None)
-    return contextlib.nullcontext(_lines()) if prints or not sys.stderr.isatty() else _bars()
+    has_bars = not prints and sys.stderr.isatty() and not Console(stderr=True).is_dumb_terminal
+    return _bars() if has_bars else contextlib.nullcontext(_lines())
 
 
 @contextlib.contextmanager
@@ -171,11 +172,8 @@ MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
 
 def option_arguments(**values: object) -> list[str]:
     """Return the command-line options with these values, in their order; None leaves an option out, True is a flag."""
-    words: list[str] = []
-    for name, value in values.items():
-        if value is not None:
-            words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
-    return words
+    given = {f"--{name.replace('_', '-')}": value for name, value in values.items() if value is not None}
+    return [word for name, value in given.items() for word in ([name] if value is True else [name, str(value)])]
 
 
 def finish(result: str, purpose: str, *command: object, file: TextIO | None = None, **options: object) -> None:
@@ -254,18 +252,28 @@ def main() -> None:
         if package not in TRAINING_PACKAGES:
             raise
         _exit_with(f"{package} is not installed; this command needs it, recognition does not: see docs/install.md")
-    except RuntimeError as error:
-        if "Symlink loop" not in str(error):  # of Path.resolve
+    except (AssertionError, InputError, OSError, RuntimeError) as error:
+        _check_platforms()
+        if not isinstance(error, (InputError, OSError)) and "Symlink loop" not in str(error):  # of Path.resolve
             raise
-        _exit_with(str(error))
-    except (InputError, OSError) as error:
         _exit_with(_with_options(reason_of(error)))
     finally:
         sys.unraisablehook = report
         for number, handler in previous.items():
             if signal.signal(number, handler) is signal.SIG_DFL:
                 signal.raise_signal(number)
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # Python would show an exception during its exit
     raise SystemExit(status)
+
+
+def _check_platforms() -> None:
+    """End this process if JAX cannot start with JAX_PLATFORMS, which seems to damage whatever file is read first."""
+    if (platforms := os.environ.get("JAX_PLATFORMS")) and "jax" in sys.modules:
+        try:
+            sys.modules["jax"].devices()
+        except Exception as error:
+            _exit_with(f"JAX_PLATFORMS is {platforms} ({reason_of(error)}); expected one of this machine, such as cpu")
 
 
 def _with_options(message: str) -> str:

@@ -197,8 +197,7 @@ def recognize(
     options.check_belongs("--bag", recording, out_bag=outputs.out_bag)
     options.check_belongs("--coco and --bop", any(table.values()), names=outputs.names)
     options.check_belongs("--track", track, poses=poses)
-    pool = processes.pool()
-    if pool is not None and (track or not frames):
+    if (pool := processes.pool()) is not None and (track or not frames):
         reason = "--track, which takes the frames in turn" if track else "one frame"
         raise InputError(
             f"workers is {processes.workers} and engine is {processes.engine}, of no use for {reason}; leave them out"

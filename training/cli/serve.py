@@ -2,6 +2,8 @@
 
 import dataclasses
 import os
+import shutil
+from multiprocessing.util import get_temp_dir
 from pathlib import Path
 from typing import Annotated
 
@@ -73,4 +75,5 @@ def serve(
             **vars(given),
         )
     serve_forever(settings, host, port, workers)
-    os._exit(0)  # a normal exit would wait until explanations are compiled
+    shutil.rmtree(get_temp_dir(), ignore_errors=True)  # as a normal exit does, which would wait for a compilation
+    os._exit(0)

@@ -162,8 +162,7 @@ def sample_objects(
     render = functools.partial(render_clouds, views=views)
     with contextlib.closing(pool(render, missing.values())) as results:
         for (file, task), rendered in zip(missing.items(), results, strict=True):
-            invisible = task.keys() - {index for index, _ in rendered}
-            if invisible:
+            if invisible := task.keys() - {index for index, _ in rendered}:
                 raise InputError(f"object {sources[min(invisible)]} has no view with enough points; leave it out")
             rng = np.random.default_rng([SEED, len(sources), min(task)])
             rendered = sorted(rendered, key=lambda view: len(view[1][0]))  # for batches with little padding
@@ -254,8 +253,7 @@ class Distractors:
         arguments = self.sources, network, config, self.views
         sample = functools.partial(sample_objects, *arguments, local_workers(self.workers), progress)
         name = f"distractors-{json_digest(samples_record(*arguments))}"
-        cache = cache_directory("distractors")
-        if cache is not None:
+        if (cache := cache_directory("distractors")) is not None:
             try:
                 cache.mkdir(mode=0o700, parents=True, exist_ok=True)
                 samples = sample(directory=cache / name)

@@ -76,8 +76,7 @@ def evaluate_dataset(
         OSError: a file cannot be written.
     """
     check_output_directory(out, ANSWERS)
-    names = frames.names()
-    if names is not None:
+    if (names := frames.names()) is not None:
         check_known(names, runs[0].classes)  # not only after all frames are recognized
     if not out.exists():
         frames[0]  # raises if it cannot be read, before anything is written

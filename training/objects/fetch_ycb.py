@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import httpx
 
 from thor2_jax.errors import InputError, reason_of
-from thor2_jax.files import atomic_directory, check_output_directory, locked
+from thor2_jax.files import atomic_directory, check_output_directory, errors_name, locked
 from training.objects.meshes import load_mesh
 from training.storage.jobs import Progress
 
@@ -99,7 +99,7 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
             if answer.status_code != 206:  # the server sends the whole archive
                 have = 0
             total = have + int(answer.headers.get("Content-Length", 0))
-            with archive.open("ab" if have else "wb") as stream:
+            with errors_name(archive), archive.open("ab" if have else "wb") as stream:
                 for block in answer.iter_raw():
                     have += len(block)
                     if max(have, total) > MAX_BYTES:
@@ -119,7 +119,7 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
 
 
 def _extract(archive: Path, directory: Path, name: str) -> None:
-    """Move the files of the archive to `directory / name` and remove the archive, except after an interrupt.
+    """Move the files of the archive to `directory / name`; remove it, except after an interrupt or on a full disk.
 
     Only regular files in `google_16k` are moved, without their folders. The archive is read to its end, so that the
     checksum of gzip is verified.
@@ -148,5 +148,5 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
         reason = reason_of(error).replace(f"{folder.parent}/", "")
         raise InputError(f"objects: archive of {name} has no usable mesh ({reason}); report this to its host") from None
     finally:
-        if sys.exc_info()[0] is not KeyboardInterrupt:
+        if not isinstance(sys.exc_info()[1], (KeyboardInterrupt, OSError)):
             archive.unlink()

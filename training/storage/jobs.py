@@ -48,8 +48,7 @@ def cache_directory(kind: str) -> Path | None:
     Raises:
         InputError: THOR2_CACHE names a file.
     """
-    value = os.environ.get(VARIABLE, "")
-    if value == "off":
+    if (value := os.environ.get(VARIABLE, "")) == "off":
         return None
     try:
         directory = Path(value).expanduser() if value else platformdirs.user_cache_path("thor2-jax") / kind
@@ -132,16 +131,14 @@ def begin_job(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> 
         OSError: the record cannot be written.
     """
     check_begun(directory, job, name)
-    file = directory / name
-    if not file.is_file():
+    if not (file := directory / name).is_file():
         file.parent.mkdir(parents=True, exist_ok=True)
         write_text(file, json.dumps(job, indent=1) + "\n")
 
 
 def check_begun(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> None:
     """Raise InputError if a directory has a damaged record or the record of another job; arguments as `begin_job`."""
-    file = directory / name
-    if file.is_file():
+    if (file := directory / name).is_file():
         with decoding(f"out: {file} cannot be read", advice=f"delete {file.parent} to start anew"):
             begun = dict(json.loads(file.read_bytes()))
         check_same_job(directory, begun, job)

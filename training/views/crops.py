@@ -195,8 +195,7 @@ def read_crop_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]
     Raises:
         InputError: the manifest is missing, damaged or of another format.
     """
-    path = directory / MANIFEST
-    if not path.is_file():
+    if not (path := directory / MANIFEST).is_file():
         raise InputError(
             f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
             "`thor2 render` command with --crops"

@@ -222,8 +222,7 @@ class ViewDataset:
 
     def content(self, file: str, digest: str, command: str = "`thor2 render`") -> bytes:
         """Return the bytes of a file; raise InputError, which says to repeat the command, if it is not intact."""
-        content = intact_content(self.directory, file, digest)
-        if content is None:
+        if (content := intact_content(self.directory, file, digest)) is None:
             raise InputError(f"dataset: {self.directory / file} is missing or damaged; repeat {command} to restore it")
         return content
 

@@ -134,6 +134,20 @@ def test_metrics_of_workers_need_no_space_later(tmp_path: Path, monkeypatch: pyt
     assert len(files) == 3 and all(file.st_blocks * 512 >= file.st_size for file in files)
 
 
+def test_a_service_leaves_no_directory_of_its_workers(run_dir: Path) -> None:
+    code = """
+import os
+from unittest import mock
+from training.cli import main
+from thor2_jax.service import server
+server.InferenceEngine = server._Supervisor = mock.Mock()
+server._Supervisor.return_value.run = lambda: print(os.environ["PROMETHEUS_MULTIPROC_DIR"], flush=True)
+main()
+"""
+    (printed,) = finish_programs(start_program(code, "serve", "--model", run_dir, "--workers", 2, "--port", 0))
+    assert printed and not Path(printed.strip()).parent.exists()
+
+
 def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch, request: Any) -> None:
     """It ends a worker at once, which then does not compile for a minute; uvicorn handles it in a ready worker."""
     app, actions = create_app(Settings(run_dir), workers=2), []

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from threading import Timer
 from typing import Any
+from unittest import mock
 
 import pytest
 from commands import Command, run_thor2
@@ -211,6 +212,26 @@ sys.modules["training.cli.app"].main()
     assert not os.listdir(tmp_path)
 
 
+def test_a_second_ctrl_c_ends_the_exit_without_a_traceback() -> None:
+    code = """
+import atexit, signal, sys
+import training.cli
+signal.signal(signal.SIGINT, signal.default_int_handler)  # in a background job, it is ignored
+sys.modules["training.cli.app"].app = lambda **_: atexit.register(signal.raise_signal, signal.SIGINT) and 130
+sys.modules["training.cli.app"].main()
+"""
+    done = run_python("-c", code)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+@pytest.mark.parametrize("error", [AssertionError(), RuntimeError("no backend"), thor2.InputError("damaged")])
+def test_platforms_that_jax_lacks_are_named(error: Exception, refused: Command, monkeypatch: Any) -> None:
+    monkeypatch.setenv("JAX_PLATFORMS", "absent")
+    for module, name in (("jax", "devices"), ("training.cli.app", "app")):
+        monkeypatch.setattr(sys.modules[module], name, mock.Mock(side_effect=error))
+    assert "JAX_PLATFORMS is absent" in refused("demo")
+
+
 class Finalized:
     """An object whose finalizer is interrupted."""
 
@@ -247,11 +268,14 @@ def test_ctrl_c_where_exceptions_are_ignored(interrupted: Any, busy: bool, monke
         run_thor2("demo")
 
 
-# Progress on a standard error that is not a terminal.
+# Progress on a standard error that is not a terminal, or on a terminal that cannot move its cursor.
 
 
-def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_lines_come_every_few_seconds(is_terminal: bool, capsys: Any, monkeypatch: Any) -> None:
     now = [100.0]
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
     monkeypatch.setattr("training.storage.jobs.time.monotonic", lambda: now[0])
     with show_progress(quiet=True) as show:
         show("render", 0, 10, "")
@@ -294,6 +318,7 @@ def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytes
 def test_a_narrow_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The note is cut, then the bar and the name of the stage, not the numbers."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
     long = "stage 3 of 9: fold 0: describe for the embedding"
     for width, stage, done, total, note in (
         (80, "render [red]", 3, 10, "of [/x]"),
@@ -311,6 +336,7 @@ def test_the_running_stage_is_within_a_terminal(monkeypatch: pytest.MonkeyPatch)
     """A live display is cut at the height of the terminal."""
     bars: list[Progress] = []
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("LINES", "10")
     whole = Progress.__init__
     monkeypatch.setattr(Progress, "__init__", lambda self, *a, **k: (bars.append(self), whole(self, *a, **k))[1])

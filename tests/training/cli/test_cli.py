@@ -241,7 +241,10 @@ def test_train_by_sequences(meshes: Path, views: Path, tmp_path: Path, refused: 
     first = (out / "table/a/run.json").read_bytes()
     assert sorted(json.loads(first)["classes"]) == sorted([soup, mug])
     table.write_text(json.dumps({"table/a": [soup, mug], "b": [box, box, soup]}))
+    with temporary_directory(out / "table/a") as temporary:
+        shutil.copytree(temporary, out / "table/a" / ".thor2-killed")
     assert run_thor2(*arguments) == 0
+    assert not list(out.rglob(".thor2-*"))
     assert (out / "table/a/run.json").read_bytes() == first
     assert sorted(json.loads((out / "b/run.json").read_text())["classes"]) == sorted([soup, box])
     before = sorted(out.rglob("*"))

@@ -99,11 +99,18 @@ def test_broken_download_resumes(server: Any, tmp_path: Path, ranges: bool) -> N
     assert (tmp_path / NAME / "textured.obj").read_bytes() == OBJ
 
 
-def test_an_interrupted_extraction_keeps_the_archive(server: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("training.objects.fetch_ycb.load_mesh", Mock(side_effect=KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_an_interrupted_extraction_keeps_the_archive(error: Any, server: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("training.objects.fetch_ycb.load_mesh", Mock(side_effect=error))
+    with pytest.raises(error):
         fetch_ycb([NAME], tmp_path, url=server.url)
     assert sorted(path.name for path in tmp_path.iterdir()) == [f".{NAME}.tgz", ".lock"]
+
+
+def test_a_full_disk_names_the_archive(server: Any, tmp_path: Path) -> None:
+    (tmp_path / f".{NAME}.tgz").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=str(tmp_path / f".{NAME}.tgz")):
+        fetch_ycb([NAME], tmp_path, url=server.url)
 
 
 DAMAGED = {
