@@ -7,7 +7,7 @@ similar colour and place. The parts, unions of neighbouring parts and all of it 
 best one is the next object. If its surface is known, pixels whose points lie on the surface are added to it, and others
 are removed. If fewer than two names were found in a piece, or too little of it is known, the piece remains. Neighbours
 are then merged repeatedly if their union is recognized better than each of them. In the end, pixels go to the object on
-whose surface their points lie.
+whose surface their points lie. Large images are divided at a lower resolution.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation.pixels import Mask, components, filled, grow, renumbered, window
+from thor2_jax.segmentation.pixels import Mask, components, filled, grow, renumbered, subsampled, window
 
 __all__ = ["Distances", "fit_masks", "segment_known"]
 
@@ -37,6 +37,9 @@ Distances = Callable[[NDArray[np.floating]], NDArray[np.float64]]
 
 Locate = Callable[[RGBDFrame], Mapping[int, Distances]]
 """Function from a frame with labels to label -> distances from the surface, for all known objects."""
+
+WORKING_SIZE = 640
+"""Larger side, pixels, of the images that are divided; images of at least twice this size are subsampled."""
 
 LEAST_PART, MOST_PARTS = 1000, 6
 """Smallest average number of pixels of a part, and largest number of parts of a region."""
@@ -92,6 +95,10 @@ def segment_known(
     Returns:
         Labels [H, W]: 0 is background, and the objects are numbered from 1.
     """
+    if (stride := max(labels.shape) // WORKING_SIZE) > 1:
+        small = segment_known(subsampled(frame, stride), labels[::stride, ::stride], recognize, locate)
+        enlarged = small.repeat(stride, axis=0).repeat(stride, axis=1)[: labels.shape[0], : labels.shape[1]]
+        return fit_masks(frame, enlarged, locate)
     divided, features = np.zeros(labels.shape, np.int32), _features(frame)
     values = np.unique(labels[labels > 0])  # renumbered from 1, so that numbers of parts can be added to any label
     labels = np.where(labels > 0, np.searchsorted(values, labels) + 1, 0).astype(np.int32)

@@ -1,8 +1,12 @@
 """Image operations of OpenCV with NumPy's types; masks are boolean images [H, W]."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = [
     "Mask",
@@ -16,6 +20,7 @@ __all__ = [
     "pixel_mask",
     "renumbered",
     "shrink",
+    "subsampled",
     "watershed",
     "window",
 ]
@@ -95,6 +100,14 @@ def label_borders(labels: NDArray[np.int32], size: int) -> Mask:
     """Return the pixels with more than one label in the square of `size` pixels around them; labels are 0 to 65535."""
     square, image = np.ones((size, size), np.uint8), labels.astype(np.uint16)
     return np.asarray(cv2.dilate(image, square) != cv2.erode(image, square))
+
+
+def subsampled(frame: RGBDFrame, stride: int) -> RGBDFrame:
+    """Return a frame with the depth of every `stride`-th row and column, and mean colours; it has no labels."""
+    depth, camera = np.ascontiguousarray(frame.depth[::stride, ::stride]), frame.intrinsics
+    color = np.asarray(cv2.resize(frame.color, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+    scaled = {name: getattr(camera, name) / stride for name in ("fx", "fy", "cx", "cy")}
+    return RGBDFrame(color, depth, None, dataclasses.replace(camera, width=None, height=None, **scaled))
 
 
 def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.segmentation.foreground import Evidence
 from thor2_jax.segmentation.pieces import find_pieces
-from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, watershed, window
+from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, subsampled, watershed, window
 from thor2_jax.segmentation.planes import LARGEST_AREA, DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
@@ -53,17 +53,14 @@ def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
         pixels. Without a dominant plane, everything is background. Equal frames get equal labels.
     """
     stride = max(1, round(max(frame.depth.shape) / WORKING_SIZE))
-    height, width = (-(-side // stride) for side in frame.depth.shape)
-    color = np.asarray(cv2.resize(frame.color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    camera = frame.intrinsics
+    small = subsampled(frame, stride)
     # Lens distortion is ignored, since the planes' second-order terms absorb it.
-    subsampled = Intrinsics(camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
-    depth = DepthImage(np.ascontiguousarray(frame.depth_m[::stride, ::stride]), subsampled)
+    depth = DepthImage(small.depth_m, small.intrinsics)
     planes = dominant_planes(depth)
     if not planes:
         return np.zeros(frame.depth.shape, np.int32)
-    evidence = Evidence(color, depth, planes)
-    labels = _cleaned(find_pieces(color, depth, evidence), depth, planes)
+    evidence = Evidence(small.color, depth, planes)
+    labels = _cleaned(find_pieces(small.color, depth, evidence), depth, planes)
     return _refined(labels, frame.color, stride) if stride > 1 else labels
 
 

@@ -1,5 +1,6 @@
 """Pieces that are divided and merged by recognition: toy answers by the overlap with true masks."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from unittest.mock import Mock
 
@@ -55,6 +56,16 @@ def test_only_pieces_of_one_known_object_are_merged() -> None:
     large = np.where(TRUTH > 0, TRUTH + (2**31 - 3), 0).astype(np.int32)
     for labels in (TRUTH, large):
         np.testing.assert_array_equal(segment_known(FRAME, labels, knows(TRUTH == 1, TRUTH == 2), nowhere), TRUTH)
+
+
+def test_a_large_image_is_divided_at_a_lower_resolution() -> None:
+    small = FRAME.intrinsics
+    camera = dataclasses.replace(small, fx=2 * small.fx, fy=2 * small.fy, cx=2 * small.cx, cy=2 * small.cy)
+    color, depth, piece = (each.repeat(2, 0).repeat(2, 1) for each in (FRAME.color, FRAME.depth, ONE_PIECE))
+    recognize = knows(TRUTH == 1, TRUTH == 2)
+    labels = segment_known(RGBDFrame(color, depth, None, camera), piece, recognize, nowhere)
+    np.testing.assert_array_equal(labels[::2, ::2], segment_known(FRAME, ONE_PIECE, recognize, nowhere))
+    np.testing.assert_array_equal(labels > 0, piece > 0)
 
 
 def test_frames_without_pieces_or_without_depth_remain() -> None:
