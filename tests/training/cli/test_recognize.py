@@ -148,7 +148,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --color frames/one/color.png", "give either"),
         ("empty", "has no color.png"),
         ("frames --names frames/names.json", "it belongs to --coco"),
-        ("frames --coco empty/c.json --names frames/one/intrinsics.json", "expected an obj_id"),
+        ("frames --coco empty/c.json --names frames/one/intrinsics.json", "expected an integer"),
         *((f"frames --{to} {path}", f"{to}: {path} is not a file") for to in ("coco", "bop") for path in no_files),
         ("frames --out frames", "expected a new or empty directory"),
         ("frames --depth-scale 1e-300", "error: --depth-scale is 1e-300"),
