@@ -153,8 +153,7 @@ def _check_glb(path: Path) -> None:
         if types.get("COLOR_0") == UNSIGNED_SHORT and "material" not in primitive:
             unsupported.add("vertex colours of 16 bits without a material")
     if unsupported:
-        uses = f"it uses {', '.join(sorted(unsupported))}"
-        raise InputError(f"{uses}; export it with pbrMetallicRoughness, without compression and texture transforms")
+        raise InputError(f"it uses {', '.join(sorted(unsupported))}; export it without, with pbrMetallicRoughness")
     for material in header.get("materials", ()):
         base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
         if base.get("texCoord"):

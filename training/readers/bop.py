@@ -149,8 +149,9 @@ def _mask(path: Path, depth: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _images(folder: Path) -> list[Path]:
-    files = (f for f in folder.glob("*") if f.suffix in (".png", ".jpg") and f.stem.isdecimal())
-    return sorted(files, key=lambda f: int(f.stem))
+    """Return the images of a scene by number; one that is there as JPEG and PNG counts once."""
+    files = {int(f.stem): f for f in sorted(folder.glob("*")) if f.suffix in (".png", ".jpg") and f.stem.isdecimal()}
+    return [files[number] for number in sorted(files)]
 
 
 def read_object_names(path: Path) -> dict[int, str]:

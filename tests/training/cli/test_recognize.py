@@ -175,6 +175,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("BAG --out-bag x --out x", "out and --out-bag are x"),
         ("BAG --out-bag in.mcap/a.mcap", "a.mcap is not a file that can be written (Not a directory)"),
         ("BAG --color-topic /x", "--color-topic is /x"),
+        ("BAG --camera-topic /c --intrinsics k.json", "--camera-topic is /c and --intrinsics is k.json"),
         ("BAG --max-gap 1e300", "--max-gap is 1e+300"),
         ("BAG --every 99999999999999999999", "'--every'"),
         ("BAG --depth-scale 0", "error: --depth-scale is 0"),
