@@ -166,7 +166,8 @@ def train(
     options.check_belongs("--meshes or --distractors", given.meshes or distractors, mesh_scale=scale)
     options.check_belongs("--dataset", given.dataset, sequences=given.sequences)
     options.check_alone("sequences", given.sequences, leave_out=leave_out)
-    options.check_belongs("--coordinator", coordinator, processes=processes if processes > 1 else None)
+    if coordinator is None and (processes, process) != (1, 0):
+        raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
         raise InputError(f"process is {process}; expected less than --processes, which is {processes}")
     if coordinator is not None:
