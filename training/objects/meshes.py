@@ -81,8 +81,8 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     if visual.kind in ("vertex", "face"):
         ply = geometry.metadata.get("_ply_raw")
         stored = [] if ply is None else [ply[visual.kind]["data"][name] for name in ("red", "green", "blue")]
-        if any(each.dtype.kind == "f" and each.max() > 1 for each in stored):
-            raise InputError("its colours cannot be read, which are floats above 1; expected 0 to 1, or integers")
+        if any(each.max() > (1 if each.dtype.kind == "f" else 255) for each in stored):
+            raise InputError("its colours cannot be read; expected floats from 0 to 1, or integers from 0 to 255")
         colors = visual.vertex_colors[faces] if visual.kind == "vertex" else visual.face_colors[:, None].repeat(3, 1)
         if len(colors) != len(faces):
             raise InputError("its colours cannot be read, which are of polygons; triangulate the mesh")

@@ -220,7 +220,8 @@ def test_colours_and_indices_that_trimesh_misreads(tmp_path: Path) -> None:
     faces = trimesh.Trimesh(QUAD, QUAD_FACES, face_colors=CORNERS[:2]).export(file_type="ply", encoding="ascii")
     changes = [(b"uchar red", b"ushort red"), (b"uchar red", b"float red"), (b"1.0\n", textures)]
     of_faces = (faces, changes[1]), (faces, (b"3 0 1 2", b"4 0 1 2 3"))
-    for ply, change in (*((ASCII_PLY, change) for change in changes), *of_faces):
+    large = ASCII_PLY.replace(b"99 99 99", b"999 99 99"), (b"uchar red", b"int red")
+    for ply, change in (*((ASCII_PLY, change) for change in changes), *of_faces, large):
         (tmp_path / "quad.ply").write_bytes(ply.replace(*change, 1))
         check_refused(tmp_path / "quad.ply", "colours cannot be read")
 
