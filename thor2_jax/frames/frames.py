@@ -247,7 +247,7 @@ def decode_image(
             raise ValueError("JPEG compression changes label numbers")
         # 274 is the orientation, by which Pillow turns a TIFF, unlike the other formats.
         if image.format == "TIFF" and (getattr(image, "is_animated", False) or image.getexif().get(274, 1) != 1):
-            raise ValueError("it has several pages, or a tag that turns it")
+            raise ValueError("it has several pages or is turned; save it as one page with orientation 1")
         image.verify()  # decoding does not check the checksums of a PNG
     stream.seek(0)
     with Image.open(stream, formats=formats) as image:
