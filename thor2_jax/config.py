@@ -111,7 +111,7 @@ class DescriptorConfig:
         _check(self, "a positive number", _is_positive, *numbers)
         counts = "n_slices", "n_strips", "image_size"
         _check(self, "a positive integer", lambda value: type(value) is int and value > 0, *counts)
-        _check(self, "a finite angle in radians", _is_finite, "alpha")
+        _check(self, "radians, at most 2 pi", lambda value: _is_finite(value) and abs(value) <= math.tau, "alpha")
         _check(self, "a Relaxation or None", lambda value: isinstance(value, Relaxation | None), "relaxation")
         fixed = {"relaxation": None, "sigma_1": 0.1, "sigma_2": 0.025} if self.convention == "released" else {}
         for name, value in fixed.items():

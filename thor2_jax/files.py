@@ -9,6 +9,7 @@ import math
 import os
 import re
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -279,11 +280,7 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str] 
 
 
 def unpack_arrays(content: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Return the arrays and the texts of `pack_arrays`.
-
-    Raises:
-        ValueError: the content is damaged.
-    """
+    """Return the arrays and the texts of `pack_arrays`; raise ValueError if the content is damaged."""
     import safetensors.numpy
 
     try:
@@ -326,22 +323,26 @@ MAX_YAML_VALUES = 10**6
 
 
 def parse_json(content: bytes) -> Any:
-    """Return the value in a JSON file.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Return the value in a JSON file; raise ValueError if it is damaged, or a table in it has a key twice."""
     try:
-        return json.loads(content)
+        return json.loads(content, object_pairs_hook=_table)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def _table(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    """Return a table; raise ValueError for a repeated key, of whose values all but the last would be lost."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        raise ValueError(f"it has the key {Counter(key for key, _ in pairs).most_common(1)[0][0]!r} twice")
+    return table
 
 
 def parse_yaml(content: bytes) -> Any:
     """Return the value in a YAML file, built from plain types.
 
     Raises:
-        ValueError: the file is damaged, larger than `MAX_YAML_BYTES` or expands to more than `MAX_YAML_VALUES`.
+        ValueError: the file is damaged, has a repeated key or a merge key (<<), or is too large (`MAX_YAML_VALUES`).
     """
     import yaml
 
@@ -349,12 +350,11 @@ def parse_yaml(content: bytes) -> Any:
         return int(node.value) if node.value.isdecimal() else int(each.construct_yaml_int(node))
 
     loader: Any = type("Loader", (yaml.SafeLoader,), {})
+    loader.add_constructor("tag:yaml.org,2002:map", lambda each, node: _table(each.construct_pairs(node, deep=True)))
     loader.add_constructor("tag:yaml.org,2002:int", integer)
     if len(content) > MAX_YAML_BYTES:
         raise ValueError(f"it has {len(content)} bytes; expected at most {MAX_YAML_BYTES}")
     try:
-        if b"<<" in content and any(getattr(token, "value", None) == "<<" for token in yaml.scan(content)):
-            raise ValueError("it has a merge key (<<), which can repeat its entries without a limit")
         value = yaml.load(content, loader)
         size = _expanded_size(value, {})
     # The constructors of YAML's tags raise several kinds of exception, all of them caused by the content.

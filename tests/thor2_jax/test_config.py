@@ -32,7 +32,7 @@ INVALID = [
         for value in NO_POSITIVE_NUMBERS
     ],
     *[(DescriptorConfig, name, v) for name in ("n_slices", "n_strips", "image_size") for v in (0, -1, 7.0, "7", True)],
-    *[(DescriptorConfig, "alpha", value) for value in (math.nan, -math.inf, "45", None, 10**400)],
+    *[(DescriptorConfig, "alpha", value) for value in (math.nan, -math.inf, "45", 45, None, 10**400)],
     *[(DescriptorConfig, "relaxation", value) for value in (0.1, "soft", {"slice": 0.1})],
     *[(Relaxation, field.name, value) for field in dataclasses.fields(Relaxation) for value in NO_POSITIVE_NUMBERS],
 ]

@@ -161,9 +161,9 @@ def test_shared_and_nested_yaml_values_are_read() -> None:
     "content",
     [
         *(b"[" * 5000, b"[1", b"a: 0x" + b"f" * 5000, b"<<: {a: 1}", b"!!int ''"),
-        *(b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"a: !!python/object/apply:os.getpid []"),
+        *(b"{1: a, 01: b}", b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"a: !!python/object/apply:os.getpid []"),
     ],
-    ids=["deep", "open", "digits", "merge", "int", "cycle", "alias", "call"],
+    ids=["deep", "open", "digits", "merge", "int", "repeated", "cycle", "alias", "call"],
 )
 def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
     with pytest.raises(ValueError):
@@ -181,6 +181,6 @@ def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_damaged_json_is_refused(tmp_path: Path) -> None:
-    for content in ("[" * 10**6, "1" * 10**5, '{"fx": ' * 10**5, "[", "{} {}"):
+    for content in ("[" * 10**6, "1" * 10**5, '{"fx": ' * 10**5, "[", "{} {}", '{"a": {"1": 1, "1": 2}}'):
         (tmp_path / "a.json").write_text(content)
         assert_refused(r"a\.json is damaged", files.read_table, tmp_path / "a.json")

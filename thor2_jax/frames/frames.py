@@ -234,7 +234,8 @@ def decode_image(
 
     Raises:
         ImageSizeError: the image has more than `max_pixels` pixels.
-        Exception: of any type, if the image is damaged, not in `formats` or, with `lossless`, has JPEG compression.
+        Exception: of any type, if the image is damaged, not in `formats`, a TIFF of several pages or with another
+            orientation than 1, or, with `lossless`, has JPEG compression.
     """
     try:
         opened = Image.open(stream, formats=formats)
@@ -244,6 +245,9 @@ def decode_image(
         check_size(*image.size, max_pixels)
         if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
             raise ValueError("JPEG compression changes label numbers")
+        # 274 is the orientation, by which Pillow turns a TIFF, unlike the other formats.
+        if image.format == "TIFF" and (getattr(image, "is_animated", False) or image.getexif().get(274, 1) != 1):
+            raise ValueError("it has several pages or is turned; save it as one page with orientation 1")
         image.verify()  # decoding does not check the checksums of a PNG
     stream.seek(0)
     with Image.open(stream, formats=formats) as image:
@@ -292,13 +296,12 @@ def read_depth(path: str | Path) -> NDArray[Any]:
         pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth", _DEPTH_FORMATS)[0]
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
-    kind, size = pixels.dtype.kind, pixels.dtype.itemsize
-    if pixels.ndim != 2 or 0 in pixels.shape or kind not in "uif" or (kind != "f" and size < 2):
+    if pixels.ndim != 2 or 0 in pixels.shape or pixels.dtype.kind not in "uif" or pixels.dtype.itemsize < 2:
         raise InputError(
             f"depth: {path} has shape {pixels.shape} and type {pixels.dtype}; expected {_EXPECTED}, not a picture of "
             "depth"
         )
-    if kind == "f":
+    if pixels.dtype.kind == "f":
         return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     # Pillow reads some 16-bit files as 32-bit integers.
     largest = 2**32 - 1 if suffix == ".npy" else 2**16 - 1

@@ -87,9 +87,14 @@ def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = N
         classes: names of the objects.
         names: number -> name; other classes get no number. By default `obj_000012` has the number 12 if all classes
             have such names with different numbers, and otherwise the classes are counted from 1.
+
+    Raises:
+        InputError: a class has several numbers in `names`.
     """
     if names is not None:
         number_of = {name: number for number, name in names.items()}
+        if repeated := [name for number, name in names.items() if name in classes and number_of[name] != number]:
+            raise InputError(f"names has several numbers of {repeated[0]!r}; expected one of each name")
         return {name: number_of[name] for name in classes if name in number_of}
     matches = (re.fullmatch(r"obj_(\d+)", name) for name in classes)
     numbers = [int(match[1]) for match in matches if match]

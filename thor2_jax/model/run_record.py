@@ -1,12 +1,11 @@
 """The description of a run, run.json, and where runs are; this module does not import JAX."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
-from thor2_jax.files import read_file
+from thor2_jax.files import parse_json, read_file
 
 __all__ = ["FORMAT_WITH_SURFACES", "RUN_FILE", "RUN_FORMAT", "read_description", "run_directories"]
 
@@ -31,11 +30,11 @@ def read_description(path: Path) -> dict[str, Any]:
         InputError: the path is not a run directory, or its format or descriptor version is not supported.
     """
     try:
-        description = json.loads(read_file(path / RUN_FILE))
+        description = parse_json(read_file(path / RUN_FILE))
     except FileNotFoundError:
         fold = "".join(f", such as {run}" for run in run_directories(path)[:1])
         raise InputError(f"model: {path} is not a run directory; expected one with run.json{fold}") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"model: {path / RUN_FILE} cannot be read: {reason}") from None
     if not isinstance(description, dict) or description.get("format") not in (RUN_FORMAT, FORMAT_WITH_SURFACES):

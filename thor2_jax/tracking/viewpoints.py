@@ -10,7 +10,6 @@ is combined with the current one. The expected entropy is the mean over classes 
 """
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError, as_array, decoding
-from thor2_jax.files import as_path, read_file
+from thor2_jax.files import as_path, parse_json, read_file
 from thor2_jax.frames.outliers import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
 
@@ -81,7 +80,7 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
     """
     content = read_file(as_path(path, "poses"))
     with decoding(f"poses: {path} is invalid", "JSON: frame name -> [4, 4] matrix, or a list of matrices"):
-        stored = json.loads(content)
+        stored = parse_json(content)
         if not isinstance(stored, (dict, list)):
             raise TypeError(f"it holds a value of type {type(stored).__name__}")
     if isinstance(stored, dict):

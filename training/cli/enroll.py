@@ -62,6 +62,7 @@ def enroll(
     if name is None and any(each is not None for each in (target.label_name, target.instance, given.bag, segment)):
         raise InputError("name is missing; --label-name, --instance, --bag and --segment enroll one object")
     options.check_alone("replace", target.replace, extend=target.extend)
+    options.check_alone("instance", target.instance, label_name=target.label_name)
     scale = options.given_values(target).get("mesh_scale")
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
     from training.objects.meshes import find_object_meshes

@@ -155,6 +155,7 @@ class FrameOptions:
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
+        check_alone("intrinsics", self.intrinsics, camera_topic=self.camera_topic)
         check_alone("bag", self.bag, frames=self.frames, color=self.color, depth=self.depth, labels=self.labels)
         check_belongs("--bag", self.bag, **{n: v for n, v in given_values(self).items() if n in RECORDING_OPTIONS})
         if self.bag is None and bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):

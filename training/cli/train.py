@@ -172,9 +172,7 @@ def train(
         raise InputError(f"process is {process}; expected less than --processes, which is {processes}")
     if coordinator is not None:
         if given.meshes is not None or frames:
-            raise InputError(
-                "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
-            )
+            raise InputError("coordinator: all processes need to read a --dataset, not --meshes or --frames")
         if not re.fullmatch(r".+:[0-9]+", coordinator):
             raise InputError(f"coordinator is {coordinator!r}; expected HOST:PORT of process 0")
         jax.distributed.initialize(coordinator, processes, process)
@@ -188,6 +186,8 @@ def train(
     others = {} if distractors is None else scaled_meshes(find_meshes(distractors), given.mesh_scale)
     protocol = protocol.with_distractors(embedding, others, given.workers)
     features = None if classifiers is None else options.split_names(classifiers)
+    of_classifiers = {"batch_size": settings.batch_size, "orientation_copies": settings.orientation_copies}
+    options.check_belongs("--classifiers or --paper", features or protocol.classifiers or baselines, **of_classifiers)
     job = TrainJob(
         protocol=protocol.replace(classifiers=features, **vars(settings)),
         frames=frames or (),

@@ -36,6 +36,7 @@ MIN_SIDE = 0.001
 UNSUPPORTED_EXTENSIONS = {
     "EXT_meshopt_compression",
     "KHR_draco_mesh_compression",
+    "KHR_materials_pbrSpecularGlossiness",
     "KHR_mesh_quantization",
     "KHR_texture_basisu",
     "KHR_texture_transform",
@@ -80,8 +81,8 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     if visual.kind in ("vertex", "face"):
         ply = geometry.metadata.get("_ply_raw")
         stored = [] if ply is None else [ply[visual.kind]["data"][name] for name in ("red", "green", "blue")]
-        if any(each.dtype.kind == "f" and each.max() > 1 for each in stored):
-            raise InputError("its colours cannot be read, which are floats above 1; expected 0 to 1, or integers")
+        if any(each.max() > (1 if each.dtype.kind == "f" else 255) for each in stored):
+            raise InputError("its colours cannot be read; expected floats from 0 to 1, or integers from 0 to 255")
         colors = visual.vertex_colors[faces] if visual.kind == "vertex" else visual.face_colors[:, None].repeat(3, 1)
         if len(colors) != len(faces):
             raise InputError("its colours cannot be read, which are of polygons; triangulate the mesh")
@@ -113,6 +114,8 @@ def _texture(visual: Any, faces: NDArray[np.int32]) -> tuple[NDArray[np.float32]
         image, factor = material.baseColorTexture, material.baseColorFactor
     elif isinstance(material, SimpleMaterial):
         image, factor = material.image, None if material.image is not None else material.diffuse
+        if "kd" not in material.kwargs and (image is None or np.array_equal(image, empty_material().image)):
+            raise InputError("no material with a texture or a colour (map_Kd or Kd); export the mesh with them")
     else:
         raise InputError(f"unsupported material {type(material).__name__}")
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
@@ -123,8 +126,6 @@ def _texture(visual: Any, faces: NDArray[np.int32]) -> tuple[NDArray[np.float32]
         raise InputError("a texture, but no texture coordinates; export the mesh with them")
     if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
         raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel; convert it")
-    if isinstance(material, SimpleMaterial) and not material.kwargs and np.array_equal(image, empty_material().image):
-        raise InputError("texture coordinates, but no material with a texture or a colour")
     uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))
     texture = np.asarray(image.convert("RGB"))
     if (factor < 255).any():
@@ -152,12 +153,13 @@ def _check_glb(path: Path) -> None:
         if types.get("COLOR_0") == UNSIGNED_SHORT and "material" not in primitive:
             unsupported.add("vertex colours of 16 bits without a material")
     if unsupported:
-        uses = f"it uses {', '.join(sorted(unsupported))}"
-        raise InputError(f"{uses}; expected a GLB without compression and texture transforms; export the mesh again")
+        raise InputError(f"it uses {', '.join(sorted(unsupported))}; export it without, with pbrMetallicRoughness")
     for material in header.get("materials", ()):
         base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
         if base.get("texCoord"):
             raise InputError("its texture uses a second set of texture coordinates; export the mesh with one set")
+        if "emissiveTexture" in material and not base:
+            raise InputError("its only texture is emissive; export it as the base colour")
         source = header["textures"][base["index"]].get("source") if base else None
         image = {} if source is None else header["images"][source]
         if "bufferView" in image:  # trimesh loads the mesh without a damaged image, as white

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import as_path, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrames, named_path
+from training.readers.labelled import LabelledFrames, named_labels, named_path
 
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
 
@@ -74,8 +74,7 @@ class BOP(LabelledFrames):
         if _table(image, "gt_info").exists():
             visible = _values(image, "gt_info", "visib_fract", (int, float))
         if len(visible) != len(objects):
-            table = _table(image, "gt_info")
-            raise InputError(f"{table}: it has {len(visible)} instances, scene_gt.json {len(objects)}")
+            raise InputError(f"{_table(image, 'gt_info')} has {len(visible)} instances, scene_gt.json {len(objects)}")
         color, depth, intrinsics = _read_images(image)
         masks = [_mask(scene / MASKS / f"{image.stem}_{k:06d}.png", depth) for k in range(len(objects))]
         sizes = [int(mask.sum()) for mask in masks]
@@ -150,8 +149,9 @@ def _mask(path: Path, depth: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _images(folder: Path) -> list[Path]:
-    files = (f for f in folder.glob("*") if f.suffix in (".png", ".jpg") and f.stem.isdecimal())
-    return sorted(files, key=lambda f: int(f.stem))
+    """Return the images of a scene by number; one that is there as JPEG and PNG counts once."""
+    files = {int(f.stem): f for f in sorted(folder.glob("*")) if f.suffix in (".png", ".jpg") and f.stem.isdecimal()}
+    return [files[number] for number in sorted(files)]
 
 
 def read_object_names(path: Path) -> dict[int, str]:
@@ -161,13 +161,8 @@ def read_object_names(path: Path) -> dict[int, str]:
         InputError: the table is damaged or has other entries; the message names the file.
         OSError: the file cannot be opened.
     """
-    names: dict[int, str] = {}
-    for obj_id, name in read_table(path).items():
-        # JSON keys are strings.
-        if not str(obj_id).isdecimal() or not isinstance(name, str) or not name:
-            raise InputError(f"{path}: {obj_id!r} is {name!r}; expected an obj_id and a name")
-        names[int(obj_id)] = name
-    return names
+    items = read_table(path).items()  # the keys of JSON are strings
+    return named_labels(path, [(int(key) if str(key).isdecimal() else str(key), name) for key, name in items])
 
 
 def _values(image: Path, name: str, key: str, kind: type | tuple[type, ...]) -> list[Any]:
@@ -177,8 +172,7 @@ def _values(image: Path, name: str, key: str, kind: type | tuple[type, ...]) -> 
             values = [instance[key] for instance in entry]
         except (TypeError, KeyError):
             raise InputError(f"an image's entry is not a list of {{{key}: <number>, ...}}") from None
-        invalid = [value for value in values if not isinstance(value, kind) or isinstance(value, bool)]
-        if invalid:
+        if invalid := [value for value in values if not isinstance(value, kind) or isinstance(value, bool)]:
             raise InputError(f"{key} is {invalid[0]!r}; expected a number")
         return values
 

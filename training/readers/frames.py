@@ -8,14 +8,13 @@ import collections
 import dataclasses
 import functools
 import itertools
-import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import read_file
+from thor2_jax.files import parse_json, read_file
 from thor2_jax.frames.frames import Intrinsics, RecordedFrame, RGBDFrame, read_frame
 from thor2_jax.printable import first_names
 from thor2_jax.recordings.bags import Bag
@@ -75,7 +74,7 @@ class FrameFiles:
         """Read the names: label -> name of the object; raise InputError or OSError if they are unusable."""
         content = read_file(self.names)
         with decoding(f"{self.names} is invalid", '{"labels": {"<number>": "<name>", ...}}'):
-            entries = [(int(label), name) for label, name in json.loads(content)["labels"].items()]
+            entries = [(int(label), name) for label, name in parse_json(content)["labels"].items()]
         return named_labels(self.names, entries)
 
     def source(self, name: str, depth_scale: float | None = None) -> "FrameSource":

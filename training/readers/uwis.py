@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import parse_yaml, read_file
+from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrames, named_labels, sequence_of
 
@@ -81,8 +81,7 @@ def _stem(color: Path) -> str:
 
 
 def _truth(path: Path) -> dict[int, str]:
-    content = read_file(path)
+    objects = read_table(path)
     with decoding(f"{path} does not hold the objects of a frame", "<name>: {label: <number>, ...}"):
-        objects = parse_yaml(content)
         entries = [(entry["label"], name) for name, entry in objects.items() if name not in NOT_SCORED]
     return named_labels(path, entries)

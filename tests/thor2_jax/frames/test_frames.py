@@ -187,6 +187,14 @@ def test_lossy_labels_are_refused(tmp_path: Path) -> None:
         assert_refused(f"^labels: .*{name}.*JPEG", read_labels, tmp_path / name)
 
 
+def test_tiff_of_several_pages_or_turned_is_refused(tmp_path: Path) -> None:
+    mask = Image.fromarray(arrays()["labels"])
+    mask.save(tmp_path / "pages.tiff", save_all=True, append_images=[mask])
+    mask.save(tmp_path / "turned.tiff", tiffinfo={274: 3})
+    for name in ("pages.tiff", "turned.tiff"):
+        assert_refused(f"^labels: .*{name}.*pages", read_labels, tmp_path / name)
+
+
 def test_color_files_with_an_alpha_channel_of_16_bit_and_jpeg(tmp_path: Path) -> None:
     (tmp_path / "c.png").write_bytes(png_of_zeros(16, 12, 16))
     assert_refused("^color: .*;16", read_color, tmp_path / "c.png")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
+from refusals import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.model.recognition import Recognition, detections_of
@@ -78,3 +79,5 @@ def test_category_numbers() -> None:
     assert category_numbers(["obj_12", "obj_012"]) == {"obj_12": 1, "obj_012": 2}
     assert category_numbers(["bowl", "mug"], {14: "mug", 15: "fork"}) == {"mug": 14}
     assert category_numbers([]) == {}
+    assert category_numbers(["mug"], {1: "fork", 2: "fork", 3: "mug"}) == {"mug": 3}
+    assert_refused("several numbers of 'mug'", category_numbers, ["mug"], {1: "mug", 2: "mug"})

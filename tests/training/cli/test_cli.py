@@ -171,6 +171,9 @@ def test_options_of_protocols(meshes: Path, tmp_path: Path, refused: Command, mo
     assert paper.distractors == replace(distractors, procedural=20, epochs=3) and paper.classifiers == FEATURES
     assert job("--folds", 3).protocol == replace(default, folds=3)
     assert "quick" in refused("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
+    for option in ("--batch-size", "--orientation-copies"):
+        assert option in refused("train", "--meshes", meshes, "--out", tmp_path / "run", option, 2)
+        assert job(option, 2, "--paper").protocol != PAPER
 
 
 def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command) -> None:

@@ -240,6 +240,7 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
         (("new", *one_frame(tiny, 1)), "points"),
         (("new", "--frames", frames), "'new'; expected one of book, brick; see --label-name"),
         (("new", *frame_options(frames / "000")), "--instance"),
+        (("new", *one_frame(frames / "000", 1), "--label-name", "book"), "--label-name is book and --instance is 1"),
         (("new", *one_frame(frames / "000", 4)), "instance is 4"),
         (("new", *frame_options(tiny, labels=tiny / "color.png")), "error: color: --labels: "),
     ):

@@ -147,6 +147,8 @@ def test_obj_without_its_material_or_texture(tmp_path: Path) -> None:
     check_refused(tmp_path / "quad.obj", f"'{picture.name}' is missing")
     os.mkfifo(picture)  # reading it would never end
     check_refused(tmp_path / "quad.obj", "is missing or unreadable")
+    material.write_text("".join(line for line in material.read_text().splitlines(True) if "Kd" not in line))
+    check_refused(tmp_path / "quad.obj", "map_Kd or Kd")
     material.unlink()
     check_refused(tmp_path / "quad.obj", f"'{material.name}' is missing")
 
@@ -167,7 +169,10 @@ def test_vertices_without_faces_are_dropped(tmp_path: Path) -> None:
         np.testing.assert_allclose(load_mesh(tmp_path / "quad.ply").centre, [0.05, 0.05, 0])
 
 
-EXTENSIONS = ("KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression")
+EXTENSIONS = (
+    *("KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"),
+    "KHR_materials_pbrSpecularGlossiness",
+)
 
 
 @pytest.mark.parametrize(
@@ -178,6 +183,7 @@ EXTENSIONS = ("KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshop
         (("accessors", 1, "sparse"), {}, "sparse accessors"),
         (("meshes", 0, "primitives", 0, "mode"), 6, "triangle fans"),
         (("materials", 0, "pbrMetallicRoughness", "baseColorTexture", "texCoord"), 1, "second set"),
+        (("materials", 0), {"emissiveTexture": {"index": 0}}, "emissive"),
     ],
 )
 def test_unsupported_parts_of_gltf(tmp_path: Path, path: tuple[Any, ...], value: Any, message: str) -> None:
@@ -214,7 +220,8 @@ def test_colours_and_indices_that_trimesh_misreads(tmp_path: Path) -> None:
     faces = trimesh.Trimesh(QUAD, QUAD_FACES, face_colors=CORNERS[:2]).export(file_type="ply", encoding="ascii")
     changes = [(b"uchar red", b"ushort red"), (b"uchar red", b"float red"), (b"1.0\n", textures)]
     of_faces = (faces, changes[1]), (faces, (b"3 0 1 2", b"4 0 1 2 3"))
-    for ply, change in (*((ASCII_PLY, change) for change in changes), *of_faces):
+    large = ASCII_PLY.replace(b"99 99 99", b"999 99 99"), (b"uchar red", b"int red")
+    for ply, change in (*((ASCII_PLY, change) for change in changes), *of_faces, large):
         (tmp_path / "quad.ply").write_bytes(ply.replace(*change, 1))
         check_refused(tmp_path / "quad.ply", "colours cannot be read")
 

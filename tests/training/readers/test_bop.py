@@ -41,6 +41,8 @@ def test_the_order_of_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     for number in (10, 2):
         write_bop(tmp_path / "000050", number, seed=number)
     write_bop(tmp_path / "000048", 1000000, suffix="jpg")
+    write_bop(tmp_path / "000050", 2, suffix="jpg")  # replaced by the PNG
+    write_bop(tmp_path / "000050", 2, seed=2)
     (tmp_path / "000050" / "rgb" / "notes.txt").write_text("")
     (tmp_path / "000050" / "rgb" / "cover.png").write_bytes(b"")
     (tmp_path / "models").mkdir()

@@ -75,9 +75,10 @@ POSES = "42/images/000000_poses.yaml"
     ("kind", "file", "content", "expected"),
     [
         ("bop", "names.yaml", "8: mug\n", "obj_id 14"),
+        ("bop", "names.yaml", "8: mug\n'08': bowl\n14: cup\n", "label 8"),
         ("bop", "names.yaml", "[mug]", ""),
-        ("bop", "names.yaml", "8.0: mug", "8.0 is 'mug'"),
-        ("bop", "names.yaml", "8: ''", "8 is ''"),
+        ("bop", "names.yaml", "8.0: mug", "'8.0' has the name 'mug'"),
+        ("bop", "names.yaml", "8: ''", "8 has the name ''"),
         *(
             ("bop", f"000049/scene_{name}.json", content, expected)
             for content, expected in (("[]", ""), ({"2": []}, "no image 1"), ({"1": 7}, "entry is not"))
@@ -97,7 +98,8 @@ POSES = "42/images/000000_poses.yaml"
         *(("ocid", "names.json", [vlg_item(answer)], "item 0 is") for answer in ("mug", True)),
         ("ocid", "names.json", [vlg_item(file="seq36")], "item 0 is"),
         ("ocid", "names.json", [vlg_item(), vlg_item(target="bowl")], "the names 'mug' and 'bowl'"),
-        *(("uwis", POSES, content, "does not hold") for content in ("- mug\n", "mug: {pose: [1, 2, 3]}\n")),
+        ("uwis", POSES, "- mug\n", "holds a value of type list"),
+        ("uwis", POSES, "mug: {pose: [1, 2, 3]}\n", "does not hold"),
         ("uwis", POSES, "mug: {label: true}\n", "label True has the name 'mug'"),
         ("uwis", POSES, "12: {label: 1}\n", "label 1 has the name 12"),
         ("uwis", POSES, "' ': {label: 1}\n", "label 1 has the name ' '"),
