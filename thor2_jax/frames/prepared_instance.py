@@ -323,7 +323,7 @@ def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> Prepar
     """
     check_frame(frame)
     if label is None and len(frame.instances) != 1:
-        raise InputError(f"labels has {len(frame.instances)} instances; expected one, or its number (--instance)")
+        raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
     view = prepare_instance(frame, frame.instances[0] if label is None else label, sigma_s)
     if view.reason is not None:
         raise InputError(f"instance {view.label} cannot be used: {view.reason}")
