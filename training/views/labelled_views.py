@@ -91,6 +91,8 @@ def read_instances(
         for label, name in labels:
             try:
                 with with_context(item.identifier):
+                    if label is None and (count := len(item.frame.instances)) > 1:
+                        raise InputError(f"it has {count} instances; expected one, or the object's number (--instance)")
                     name = check_name(name) if label_name is None else name
                     of_object = views.setdefault(name, [])
                     of_object.append(instance_view(item.frame, label, sigma_s))
