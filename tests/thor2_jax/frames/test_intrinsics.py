@@ -104,7 +104,10 @@ def test_a_file_of_opencv(tmp_path: Path) -> None:
     assert read_intrinsics(tmp_path / "k.yml") == SIZED
 
 
-@pytest.mark.parametrize("name", "distortion distortion_coefficients distortion_coeffs D d coeffs distCoeffs".split())
+COEFFICIENTS = "distortion distortion_coefficients distortion_coeffs D d coeffs distCoeffs dist_coeffs dist_coeff dist"
+
+
+@pytest.mark.parametrize("name", COEFFICIENTS.split())
 @pytest.mark.parametrize("camera", [PINHOLE, {"K": MATRIX.tolist()}, {"cam_K": MATRIX.tolist()}, REALSENSE, OPEN3D])
 def test_coefficients_in_every_format(camera: dict[str, object], name: str) -> None:
     assert parse_intrinsics(as_json({**camera, name: LENS})).distortion == tuple(LENS)

@@ -91,7 +91,8 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     monkeypatch.setattr(demo, "builtin_objects", lambda: {name: everything[name] for name in names})
     monkeypatch.setattr(demo, "N_SCENES", 6)
     fit = FitOptions(epochs=4, batch_size=32)
-    small = {"azimuth_step": 90.0, "polar_step": 45.0, "fit": fit, "config": SMALL_CONFIG}
+    config = dataclasses.replace(SMALL_CONFIG, n_slices=6, n_strips=16)  # in which the objects do not overflow
+    small = {"azimuth_step": 90.0, "polar_step": 45.0, "fit": fit, "config": config}
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
 
     for stage, step in (("stage 4 of 5: fit tops", 18), ("recognize scenes", 1)):
