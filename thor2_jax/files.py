@@ -339,26 +339,26 @@ def _table(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 
 
 def parse_yaml(content: bytes) -> Any:
-    """Return the value in a YAML file, built from plain types.
-
-    Raises:
-        ValueError: the file is damaged, has a repeated key or a merge key (<<), or is too large (`MAX_YAML_VALUES`).
-    """
+    """Return the value in a YAML file; raise ValueError as `parse_json`, for a merge key, or if it is too large."""
     import yaml
+
+    def table(each: Any, node: Any) -> dict[Any, Any]:
+        if any(key.tag.endswith(":merge") for key, _ in node.value):
+            raise ValueError("it has a merge key (<<), which can repeat its entries without a limit")
+        return _table(each.construct_pairs(node, deep=True))
 
     def integer(each: Any, node: Any) -> int:  # 010 is ten, as in YAML 1.2 and in the numbers of objects of BOP
         return int(node.value) if node.value.isdecimal() else int(each.construct_yaml_int(node))
 
     loader: Any = type("Loader", (yaml.SafeLoader,), {})
-    loader.add_constructor("tag:yaml.org,2002:map", lambda each, node: _table(each.construct_pairs(node, deep=True)))
+    loader.add_constructor("tag:yaml.org,2002:map", table)
     loader.add_constructor("tag:yaml.org,2002:int", integer)
     if len(content) > MAX_YAML_BYTES:
         raise ValueError(f"it has {len(content)} bytes; expected at most {MAX_YAML_BYTES}")
     try:
         value = yaml.load(content, loader)
         size = _expanded_size(value, {})
-    # The constructors of YAML's tags raise several kinds of exception, all of them caused by the content.
-    except Exception as error:
+    except Exception as error:  # constructors raise exceptions of several kinds, all of them caused by the content
         raise ValueError(reason_of(error)) from None
     if size > MAX_YAML_VALUES:
         raise ValueError(f"its aliases expand to more than {MAX_YAML_VALUES} values")

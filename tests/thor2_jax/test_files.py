@@ -150,10 +150,12 @@ def test_json_is_known_by_its_keys(content: str, is_own: bool, tmp_path: Path) -
     assert files.has_json(tmp_path / "file", ("a", "b")) == is_own and not files.has_json(tmp_path, ("a", "b"))
 
 
-def test_shared_and_nested_yaml_values_are_read() -> None:
+def test_shared_and_nested_yaml_values_are_read_but_not_merged() -> None:
     assert files.parse_yaml(b"a: &row [1, 2]\nb: *row\n") == {"a": [1, 2], "b": [1, 2]}
     assert files.parse_yaml(b"[" * 50 + b"]" * 50) is not None
     assert files.parse_yaml(b"") is None
+    with pytest.raises(ValueError, match="merge key"):
+        files.parse_yaml(b"a: &b {x: 1}\nc: {<<: *b}")
     assert files.parse_yaml(b"{000010: 0o10, 12: 0x10, 08: -3}") == {10: "0o10", 12: 16, "08": -3}  # none is octal
 
 

@@ -103,9 +103,11 @@ def detections_of(frame: RGBDFrame, recognitions: Sequence[Recognition]) -> list
         pixels = frame.instance_pixels[recognition.label]
         rows, columns = np.divmod(pixels, width)
         box = Box(int(columns.min()), int(rows.min()), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1)
-        points = frame.points(pixels)
+        points, position = frame.points(pixels), None
         points = points[points[:, 2] > 0]
-        position: Any = tuple(points.mean(axis=0).tolist()) if len(points) else None
+        if len(points):
+            x, y, z = points.mean(axis=0).tolist()
+            position = (x, y, z)
         detections.append(Detection(recognition, box, position))
     return detections
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation.pixels import Mask, components, filled, grow, renumbered, subsampled, window
+from thor2_jax.segmentation.pixels import Mask, components, enlarged, filled, grow, renumbered, subsampled, window
 
 __all__ = ["Distances", "fit_masks", "segment_known"]
 
@@ -97,8 +97,7 @@ def segment_known(
     """
     if (stride := max(labels.shape) // WORKING_SIZE) > 1:
         small = segment_known(subsampled(frame, stride), labels[::stride, ::stride], recognize, locate)
-        enlarged = small.repeat(stride, axis=0).repeat(stride, axis=1)[: labels.shape[0], : labels.shape[1]]
-        return fit_masks(frame, enlarged, locate)
+        return fit_masks(frame, enlarged(small, stride, labels.shape), locate)
     divided, features = np.zeros(labels.shape, np.int32), _features(frame)
     values = np.unique(labels[labels > 0])  # renumbered from 1, so that numbers of parts can be added to any label
     labels = np.where(labels > 0, np.searchsorted(values, labels) + 1, 0).astype(np.int32)

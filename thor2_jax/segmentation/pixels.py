@@ -12,6 +12,7 @@ __all__ = [
     "Mask",
     "close",
     "components",
+    "enlarged",
     "filled",
     "grow",
     "label_borders",
@@ -108,6 +109,11 @@ def subsampled(frame: RGBDFrame, stride: int) -> RGBDFrame:
     color = np.asarray(cv2.resize(frame.color, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     scaled = {name: getattr(camera, name) / stride for name in ("fx", "fy", "cx", "cy")}
     return RGBDFrame(color, depth, None, dataclasses.replace(camera, width=None, height=None, **scaled))
+
+
+def enlarged(labels: NDArray[np.int32], stride: int, shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Return labels of a `subsampled` image in the shape [H, W] of the image: each fills `stride` x `stride` pixels."""
+    return labels.repeat(stride, axis=0).repeat(stride, axis=1)[: shape[0], : shape[1]]
 
 
 def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[np.int32]:

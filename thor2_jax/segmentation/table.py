@@ -14,7 +14,7 @@ from scipy import ndimage
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.segmentation.foreground import Evidence
 from thor2_jax.segmentation.pieces import find_pieces
-from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, subsampled, watershed, window
+from thor2_jax.segmentation.pixels import Mask, components, enlarged, grow, label_borders, subsampled, watershed, window
 from thor2_jax.segmentation.planes import LARGEST_AREA, DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
@@ -73,8 +73,7 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
     labels = labels[around]
     here = tuple(slice(stride * part.start, stride * part.stop) for part in around)
     markers = np.where(label_borders(labels, BAND), 0, labels + 1)
-    height, width = refined[here].shape
-    markers = markers.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]
+    markers = enlarged(markers, stride, refined[here].shape)
     blurred = np.asarray(cv2.GaussianBlur(np.ascontiguousarray(color[here]), (3, 3), 0), np.uint8)
     refined[here] = _trimmed(watershed(blurred, markers) - 1, 2 * (stride // 2) + 1)
     return refined
