@@ -1,8 +1,9 @@
 """Points of an instance: voxel grid and outlier removal (paper, section "Recognition").
 
-A mask extends past the edge of its object, onto the background and onto flying pixels between the two. Three rules
-remove these points: steps in depth show flying pixels, the mean distance to the neighbours shows stray points, and
-small pieces that are separate from the rest are background.
+A mask extends past the edge of its object, onto the background and onto flying pixels between the two. Four rules
+remove these points: steps in depth show flying pixels, pixels at the contour that are far behind others show strips of
+background, the mean distance to the neighbours shows stray points, and small pieces that are separate from the rest are
+background.
 """
 
 import math
@@ -16,7 +17,7 @@ from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 
-__all__ = ["downsample_to_fit", "flying_pixels", "remove_outliers", "voxel_downsample"]
+__all__ = ["downsample_to_fit", "flying_pixels", "remove_outliers", "strip_pixels", "voxel_downsample"]
 
 
 def voxel_downsample(
@@ -85,6 +86,13 @@ MAX_SLOPE = 15.0
 """Steepest slope of a visible surface: change of depth from pixel to pixel, in pixel widths (86 degrees from facing the
 camera)."""
 
+CELL = 6
+"""Side length of the square cells, pixels, in which strips of background are searched."""
+
+STRIP_STEP, STRIP_SLOPE = 0.05, 36.0
+"""Background is farther behind the nearest pixel of its cell and the eight adjacent ones than both values: one in
+metres, and one in pixel widths, which is a slope of 3 over two cells (72 degrees from facing the camera)."""
+
 NEIGHBORS = 30
 """Number of neighbours on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
 
@@ -124,6 +132,38 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
         there = depth[beside]
         flying |= (there < nearest) & (there > 0) & (labels[beside] == instance)
     return flying
+
+
+def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pixels of an instance show the background beside an object, in a mask that is too large.
+
+    Strips of a table beside an object are connected with it where it stands, so that they are no separate pieces.
+
+    Args:
+        frame: the frame.
+        pixels: [n] flat indices of pixels of one instance.
+        rim: [n] whether a pixel is near the contour of the mask. Strips begin there; inside a cup, for example, the
+            bottom is far behind the edge, but the edge lies between it and the contour.
+
+    Returns:
+        [n] bool; False where there is no depth.
+    """
+    depth = frame.depth_m.ravel()[pixels]
+    row, column = np.divmod(pixels.astype(np.int32), frame.depth.shape[1])
+    row, column = row // CELL, column // CELL
+    row, column = row - row.min(), column - column.min()
+    shape = row.max() + 1, column.max() + 1
+    cell = row * shape[1] + column
+    nearest = np.full(shape, np.inf, depth.dtype)  # equal types make `minimum.at` fast
+    valid = np.where(depth > 0, depth, np.inf)
+    # One wrong pixel in front of the others makes nothing background: of two successive pixels, the farther one counts.
+    np.minimum.at(nearest.ravel(), cell[1:], np.maximum(valid[1:], valid[:-1]))
+    nearest = ndimage.minimum_filter(nearest, 3)
+    limit = np.maximum(nearest + STRIP_STEP, nearest * (1 + STRIP_SLOPE / frame.intrinsics.fx))
+    far = depth > limit.take(cell)
+    begins = np.zeros(shape, bool)
+    begins.ravel()[cell[far & rim]] = True
+    return np.asarray(far & ndimage.maximum_filter(begins, 3).take(cell))
 
 
 def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:

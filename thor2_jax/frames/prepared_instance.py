@@ -25,7 +25,13 @@ from scipy.spatial import KDTree
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, check_frame, pixel_rays
 from thor2_jax.frames.intrinsics import distort
-from thor2_jax.frames.outliers import downsample_to_fit, flying_pixels, remove_outliers, voxel_downsample
+from thor2_jax.frames.outliers import (
+    downsample_to_fit,
+    flying_pixels,
+    remove_outliers,
+    strip_pixels,
+    voxel_downsample,
+)
 from thor2_jax.printable import first_names
 
 if TYPE_CHECKING:
@@ -102,14 +108,14 @@ def instance_cloud(frame: RGBDFrame, label: int) -> PreparedInstance:
     pixels = frame.instance_pixels[label]
     depth = frame.depth_m.ravel()[pixels]
     trusted = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
-    flying = flying_pixels(frame, pixels)
-    steep = 2 * int((trusted & ~flying).sum()) < int(trusted.sum())
+    rim = _near_contour(frame, label, pixels)  # becomes a further colour channel
+    background = flying_pixels(frame, pixels) | strip_pixels(frame, pixels, rim)
+    steep = 2 * int((trusted & ~background).sum()) < int(trusted.sum())
     if not steep:
-        trusted &= ~flying
+        trusted &= ~background
     valid = pixels[trusted]
     points = frame.points(valid).astype(np.float32)
-    rim = _near_contour(frame, label, pixels)[trusted]  # becomes a further colour channel
-    channels = np.column_stack([frame.color.reshape(-1, 3).take(valid, axis=0), rim * np.uint8(255)])
+    channels = np.column_stack([frame.color.reshape(-1, 3).take(valid, axis=0), rim[trusted] * np.uint8(255)])
     try:
         points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)
     except InputError:

@@ -179,6 +179,25 @@ def test_a_mask_that_extends_beyond_its_plane(reach: int, wall: float) -> None:
     assert np.abs(cloud.points[:, 2] - 0.8).max() < 1e-6
 
 
+def test_a_strip_of_the_table_beside_an_object_is_dropped() -> None:
+    """The strip is six pixels wide, begins at the foot of the object and ends 24 cm behind it."""
+    labels = patch((1, 60, 180, 100, 196))
+    depth = np.full((HEIGHT, WIDTH), 0.8) + np.maximum(180 - np.arange(HEIGHT)[:, None], 0) * 0.002
+    depth[:, :190] = 0.8
+    cloud = only(frame_of(depth, labels))
+    assert count_lost(cloud, depth, (labels == 1) & (depth == 0.8)) == 0 and not cloud.kept_by_fallback
+    assert cloud.points[:, 2].max() < 0.87
+
+
+def test_the_bottom_of_a_cup_is_kept() -> None:
+    labels = patch((1, 60, 180, 100, 220))
+    inside = patch((1, 64, 176, 104, 216)) == 1
+    depth = np.where(inside, 0.9, 0.8)
+    cloud = only(frame_of(depth, labels))
+    flying = inside & ~ndimage.binary_erosion(inside)
+    assert count_lost(cloud, depth, (labels == 1) & ~flying) == 0
+
+
 @pytest.mark.parametrize(("deep", "flagged"), [(7, False), (8, False), (9, True)])
 def test_fallback_if_more_than_half_are_flying_pixels(deep: int, flagged: bool) -> None:
     """`deep` of 16 columns are flying pixels behind the teeth of a comb."""
