@@ -86,12 +86,13 @@ MAX_SLOPE = 15.0
 """Steepest slope of a visible surface: change of depth from pixel to pixel, in pixel widths (86 degrees from facing the
 camera)."""
 
-CELL = 6
-"""Side length of the square cells, pixels, in which strips of background are searched."""
+MIN_CELL = 6
+"""Smallest side length, pixels, of the square cells in which strips of background are searched; in images of 700 pixels
+and more, it is a hundredth of the longer side, since masks of larger images extend farther past the object."""
 
-STRIP_STEP, STRIP_SLOPE = 0.05, 36.0
-"""Background is farther behind the nearest pixel of its cell and the eight adjacent ones than both values: one in
-metres, and one in pixel widths, which is a slope of 3 over two cells (72 degrees from facing the camera)."""
+STRIP_STEP, STRIP_SLOPE = 0.05, 3.0
+"""Background is farther behind the nearest pixel of its cell and the eight adjacent ones than both allow: a step in
+metres, and a slope over two cells, in pixel widths a pixel (72 degrees from facing the camera)."""
 
 NEIGHBORS = 30
 """Number of neighbours on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
@@ -150,7 +151,8 @@ def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.boo
     """
     depth = frame.depth_m.ravel()[pixels]
     row, column = np.divmod(pixels.astype(np.int32), frame.depth.shape[1])
-    row, column = row // CELL, column // CELL
+    side = max(MIN_CELL, max(frame.depth.shape) // 100)
+    row, column = row // side, column // side
     row, column = row - row.min(), column - column.min()
     shape = row.max() + 1, column.max() + 1
     cell = row * shape[1] + column
@@ -159,7 +161,7 @@ def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.boo
     # One wrong pixel in front of the others makes nothing background: of two successive pixels, the farther one counts.
     np.minimum.at(nearest.ravel(), cell[1:], np.maximum(valid[1:], valid[:-1]))
     nearest = ndimage.minimum_filter(nearest, 3)
-    limit = np.maximum(nearest + STRIP_STEP, nearest * (1 + STRIP_SLOPE / frame.intrinsics.fx))
+    limit = np.maximum(nearest + STRIP_STEP, nearest * (1 + STRIP_SLOPE * 2 * side / frame.intrinsics.fx))
     far = depth > limit.take(cell)
     begins = np.zeros(shape, bool)
     begins.ravel()[cell[far & rim]] = True

@@ -110,26 +110,24 @@ def test_flying_pixels_against_a_loop(shape: tuple[int, int], spread: int) -> No
 # Strips of background
 
 
-def strips_by_loop(depth: np.ndarray, pixels: list[tuple[int, int]], rim: np.ndarray) -> list[bool]:
-    """Return whether each of `pixels` shows background, with loops over blocks of 3 x 3 cells of 6 pixels."""
+def strips_by_loop(depth: np.ndarray, pixels: list[tuple[int, int]], rim: np.ndarray, side: int) -> list[bool]:
+    """Return whether each of `pixels` shows background, with loops over blocks of 3 x 3 cells of `side` pixels."""
+    cells = [(row // side, column // side) for row, column in pixels]
 
-    def block(row: int, column: int) -> list[int]:
-        return [k for k, (r, c) in enumerate(pixels) if abs(r // 6 - row // 6) <= 1 and abs(c // 6 - column // 6) <= 1]
+    def adjacent(here: tuple[int, int]) -> list[int]:
+        return [k for k, cell in enumerate(cells) if max(abs(cell[0] - here[0]), abs(cell[1] - here[1])) <= 1]
 
-    far = []
-    for row, column in pixels:
-        pairs = [(depth[pixels[k - 1]], depth[pixels[k]]) for k in block(row, column) if k > 0]
+    limits = {}
+    for cell in set(cells):
+        pairs = [(depth[pixels[k - 1]], depth[pixels[k]]) for k in adjacent(cell) if k > 0]
         nearest = min([max(pair) / 1000 for pair in pairs if min(pair) > 0], default=np.inf)
-        far.append(depth[row, column] / 1000 > max(nearest + 0.05, nearest * (1 + 36 / CAMERA.fx)))
-    begins = {(row // 6, column // 6) for (row, column), f, near in zip(pixels, far, rim, strict=True) if f and near}
-    return [
-        f and any((row // 6 + i, column // 6 + j) in begins for i in (-1, 0, 1) for j in (-1, 0, 1))
-        for (row, column), f in zip(pixels, far, strict=True)
-    ]
+        limits[cell] = max(nearest + 0.05, nearest * (1 + 3 * 2 * side / CAMERA.fx))
+    far = [depth[pixel] / 1000 > limits[cell] for pixel, cell in zip(pixels, cells, strict=True)]
+    return [f and any(far[k] and rim[k] for k in adjacent(cell)) for f, cell in zip(far, cells, strict=True)]
 
 
-@pytest.mark.parametrize("distance", [600, 3000])
-def test_strips_of_background_against_loops(distance: int) -> None:
+@pytest.mark.parametrize(("distance", "width", "side"), [(600, 58, 6), (3000, 58, 6), (600, 1300, 13)])
+def test_strips_of_background_against_loops(distance: int, width: int, side: int) -> None:
     """The mask of a slope has a hole, the background above, missing depth, and far pixels away from its contour."""
     rng = np.random.default_rng(distance)
     depth = distance + np.arange(58) * 6 + rng.integers(0, 4, (45, 58))
@@ -139,16 +137,18 @@ def test_strips_of_background_against_loops(distance: int) -> None:
     depth[rng.random(depth.shape) < 0.05] = 0
     labels = np.full(depth.shape, 7, np.uint8)
     labels[:5], labels[:, 54:], labels[30:40, 20:23] = 0, 3, 0
+    depth, labels = (np.pad(image, ((0, 0), (0, width - 58))) for image in (depth, labels))
     frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.uint16), labels, CAMERA)
     rim = (labels == 7) & ndimage.binary_dilation(labels != 7)
     for label, part in ((7, labels == 7), (3, labels == 3)):
         pixels = frame.instance_pixels[label]
         strips = strip_pixels(frame, pixels, rim[part])
-        expected = strips_by_loop(depth, list(map(tuple, np.argwhere(part).tolist())), rim[part])
+        expected = strips_by_loop(depth, list(map(tuple, np.argwhere(part).tolist())), rim[part], side)
         np.testing.assert_array_equal(strips, expected, strict=True)
     shown = np.zeros(depth.shape, bool)
     shown.ravel()[frame.instance_pixels[7]] = strip_pixels(frame, frame.instance_pixels[7], rim[labels == 7])
-    assert shown[5:9, :54][depth[5:9, :54] > 0].mean() > 0.9 and not shown[22:28, 30:36].any()
+    assert shown[5:9, :54][depth[5:9, :54] > 0].mean() > 0.9
+    assert shown[22:28, 30:36].any() == (side == 13)  # only larger cells reach from a contour with background
     assert shown[20:, 46:].any() == (distance == 600)  # far away, pixels are wider, so that the slope is flatter
 
 
