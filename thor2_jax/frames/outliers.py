@@ -158,13 +158,12 @@ def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.boo
     cell = row * shape[1] + column
     nearest = np.full(shape, np.inf, depth.dtype)  # equal types make `minimum.at` fast
     valid = np.where(depth > 0, depth, np.inf)
-    # One wrong pixel in front of the others makes nothing background: of two successive pixels, the farther one counts.
+    # Of two successive pixels the farther one counts, so that no single wrong pixel in front makes others background.
     np.minimum.at(nearest.ravel(), cell[1:], np.maximum(valid[1:], valid[:-1]))
     nearest = ndimage.minimum_filter(nearest, 3)
     limit = np.maximum(nearest + STRIP_STEP, nearest * (1 + STRIP_SLOPE * 2 * side / frame.intrinsics.fx))
     far = depth > limit.take(cell)
-    begins = np.zeros(shape, bool)
-    begins.ravel()[cell[far & rim]] = True
+    begins = np.bincount(cell[far & rim], minlength=limit.size).reshape(shape) > 0
     return np.asarray(far & ndimage.maximum_filter(begins, 3).take(cell))
 
 

@@ -25,13 +25,7 @@ from scipy.spatial import KDTree
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, check_frame, pixel_rays
 from thor2_jax.frames.intrinsics import distort
-from thor2_jax.frames.outliers import (
-    downsample_to_fit,
-    flying_pixels,
-    remove_outliers,
-    strip_pixels,
-    voxel_downsample,
-)
+from thor2_jax.frames.outliers import downsample_to_fit, flying_pixels, remove_outliers, strip_pixels, voxel_downsample
 from thor2_jax.printable import first_names
 
 if TYPE_CHECKING:

@@ -11,13 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.frames.outliers import (
-    downsample_to_fit,
-    flying_pixels,
-    remove_outliers,
-    strip_pixels,
-    voxel_downsample,
-)
+from thor2_jax.frames.outliers import downsample_to_fit, flying_pixels, remove_outliers, strip_pixels, voxel_downsample
 
 CAMERA = Intrinsics(611.3, 620.0, 10.0, 8.0)
 
