@@ -167,6 +167,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
     for arguments, text in (
         (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
         (("mug",), "--mesh"),
+        ((frames, frames), "give --frames FOLDER"),
         (("mug", "--frames", frames, "--mesh", tmp_path / "one.ply"), "--mesh"),
         (("mug", "--every", 2, "--mesh", tmp_path / "one.ply"), "--mesh"),
         (("--mesh", tmp_path / "one.ply"), "one.ply is one file, which needs a NAME"),
