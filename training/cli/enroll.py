@@ -55,7 +55,7 @@ def enroll(
     """
     name = None if name is None else check_name(name)
     if mesh is None and name is not None and "/" in name and Path(name).is_dir():
-        raise InputError(f"name is the folder {name!r}; expected an object. To enroll every object, give --frames FOLDER")
+        raise InputError(f"name is the folder {name!r}; expected an object. For every object, give --frames FOLDER")
     given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
     has_frames = bool(given.arguments())
     if bool(mesh) == has_frames:
