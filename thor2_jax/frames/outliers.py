@@ -91,8 +91,8 @@ MIN_CELL = 6
 and more, it is a hundredth of the longer side, since masks of larger images extend farther past the object."""
 
 STRIP_STEP, STRIP_SLOPE = 0.05, 3.0
-"""Background is farther behind the nearest pixel of its cell and the eight adjacent ones than both allow: a step in
-metres, and a slope over two cells, in pixel widths a pixel (72 degrees from facing the camera)."""
+"""Smallest distance of background behind the nearest pixel of its cell and the eight adjacent cells: the larger of a
+step in metres and a slope over two cells, in pixel widths per pixel (72 degrees from facing the camera)."""
 
 NEIGHBORS = 30
 """Number of neighbours on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
