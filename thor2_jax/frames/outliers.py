@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame
 
 __all__ = ["downsample_to_fit", "flying_pixels", "remove_outliers", "strip_pixels", "voxel_downsample"]
 
@@ -87,8 +87,8 @@ MAX_SLOPE = 15.0
 camera)."""
 
 MIN_CELL = 6
-"""Smallest side length, pixels, of the square cells in which strips of background are searched; in images of 700 pixels
-and more, it is a hundredth of the longer side, since masks of larger images extend farther past the object."""
+"""Smallest side length, pixels, of the square cells in which strips of background are searched; if the
+longer side of the image has 700 pixels or more, it is a hundredth of it, since masks extend past the object by more."""
 
 STRIP_STEP, STRIP_SLOPE = 0.05, 3.0
 """Smallest distance of background behind the nearest pixel of its cell and the eight adjacent cells: the larger of a
@@ -138,13 +138,14 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
 def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which pixels of an instance show the background beside an object, in a mask that is too large.
 
-    Strips of a table beside an object are connected with it where it stands, so that they are no separate pieces.
+    Strips of a table beside an object are connected with it where it stands, so they are not separate pieces. Strips
+    wider than a cell may remain in part.
 
     Args:
         frame: the frame.
         pixels: [n] flat indices of pixels of one instance.
-        rim: [n] whether a pixel is near the contour of the mask. Strips begin there; inside a cup, for example, the
-            bottom is far behind the edge, but the edge lies between it and the contour.
+        rim: [n] whether a pixel is near the contour of the mask. Strips begin there. The bottom of a
+            cup is far behind its edge, too, but is kept if the edge is wider than the rim.
 
     Returns:
         [n] bool; False where there is no depth.
@@ -157,7 +158,7 @@ def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.boo
     shape = row.max() + 1, column.max() + 1
     cell = row * shape[1] + column
     nearest = np.full(shape, np.inf, depth.dtype)  # equal types make `minimum.at` fast
-    valid = np.where(depth > 0, depth, np.inf)
+    valid = np.where((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH), depth, np.inf)
     # Of two successive pixels the farther one counts, so that no single wrong pixel in front makes others background.
     np.minimum.at(nearest.ravel(), cell[1:], np.maximum(valid[1:], valid[:-1]))
     nearest = ndimage.minimum_filter(nearest, 3)

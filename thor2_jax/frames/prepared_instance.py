@@ -103,10 +103,13 @@ def instance_cloud(frame: RGBDFrame, label: int) -> PreparedInstance:
     depth = frame.depth_m.ravel()[pixels]
     trusted = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
     rim = _near_contour(frame, label, pixels)  # becomes a further colour channel
-    background = flying_pixels(frame, pixels) | strip_pixels(frame, pixels, rim)
-    steep = 2 * int((trusted & ~background).sum()) < int(trusted.sum())
-    if not steep:
-        trusted &= ~background
+    skipped = False
+    for background in (flying_pixels(frame, pixels), strip_pixels(frame, pixels, rim)):
+        rest = trusted & ~background
+        if 2 * int(rest.sum()) < int(trusted.sum()):
+            skipped = True
+        else:
+            trusted = rest
     valid = pixels[trusted]
     points = frame.points(valid).astype(np.float32)
     channels = np.column_stack([frame.color.reshape(-1, 3).take(valid, axis=0), rim[trusted] * np.uint8(255)])
@@ -126,7 +129,7 @@ def instance_cloud(frame: RGBDFrame, label: int) -> PreparedInstance:
         return dataclasses.replace(EMPTY_INSTANCE, label=label, reason=reason)
     kept, relaxed = remove_outliers(points)
     points, channels, none = points.take(kept, axis=0), channels.take(kept, axis=0), np.zeros(len(kept), bool)
-    return PreparedInstance(label, points, channels[:, :3], none, False, steep or relaxed, rim=channels[:, 3] > 127)
+    return PreparedInstance(label, points, channels[:, :3], none, False, skipped or relaxed, rim=channels[:, 3] > 127)
 
 
 def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:

@@ -1,6 +1,7 @@
 """`thor2 enroll`: add new objects to a run, without training."""
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -54,7 +55,7 @@ def enroll(
     --unknown-below of `thor2 recognize`.
     """
     name = None if name is None else check_name(name)
-    if mesh is None and name is not None and "/" in name and Path(name).is_dir():
+    if mesh is None and name is not None and "/" in name and os.path.isdir(name):
         raise InputError(f"name is the folder {name!r}; expected an object. For every object, give --frames FOLDER")
     given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
     has_frames = bool(given.arguments())

@@ -189,6 +189,17 @@ def test_a_strip_of_the_table_beside_an_object_is_dropped() -> None:
     assert cloud.points[:, 2].max() < 0.87
 
 
+def test_a_rule_that_is_skipped_leaves_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = "thor2_jax.frames.prepared_instance."
+    frame = frame_of(flat(800), patch((1, 60, 180, 100, 260)))
+    monkeypatch.setattr(module + "flying_pixels", lambda _, pixels: np.arange(len(pixels)) < len(pixels) // 4)
+    expected = only(frame)
+    monkeypatch.setattr(module + "strip_pixels", lambda _, pixels, rim: np.ones(len(pixels), bool))
+    cloud = only(frame)
+    assert cloud.kept_by_fallback and not expected.kept_by_fallback
+    np.testing.assert_array_equal(cloud.points, expected.points)
+
+
 def test_the_bottom_of_a_cup_is_kept() -> None:
     labels = patch((1, 60, 180, 100, 220))
     inside = patch((1, 64, 176, 104, 216)) == 1

@@ -168,6 +168,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
         (("mug",), "--mesh"),
         ((frames, frames), "give --frames FOLDER"),
+        (("docs/" + 100 * "漢", "--frames", tmp_path / "absent"), "absent"),
         (("mug", "--frames", frames, "--mesh", tmp_path / "one.ply"), "--mesh"),
         (("mug", "--every", 2, "--mesh", tmp_path / "one.ply"), "--mesh"),
         (("--mesh", tmp_path / "one.ply"), "one.ply is one file, which needs a NAME"),
