@@ -87,8 +87,8 @@ MAX_SLOPE = 15.0
 camera)."""
 
 MIN_CELL = 6
-"""Smallest side length, pixels, of the square cells in which strips of background are searched; if the
-longer side of the image has 700 pixels or more, it is a hundredth of it, since masks extend past the object by more."""
+"""Smallest side length, pixels, of the square cells in which strips of background are searched. In larger images, cells
+are a hundredth of the longer side, since masks extend farther past the object."""
 
 STRIP_STEP, STRIP_SLOPE = 0.05, 3.0
 """Smallest distance of background behind the nearest pixel of its cell and the eight adjacent cells: the larger of a
@@ -144,8 +144,8 @@ def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.boo
     Args:
         frame: the frame.
         pixels: [n] flat indices of pixels of one instance.
-        rim: [n] whether a pixel is near the contour of the mask. Strips begin there. The bottom of a
-            cup is far behind its edge, too, but is kept if the edge is wider than the rim.
+        rim: [n] whether a pixel is near the contour of the mask. Strips begin there. The bottom of a cup is far behind
+            its edge, too, but is kept if the edge is wider than the rim.
 
     Returns:
         [n] bool; False where there is no depth.
