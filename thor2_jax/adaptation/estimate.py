@@ -56,6 +56,7 @@ def entropy(probabilities: jax.Array) -> jax.Array:
     return -(every * jnp.log(every)).sum(axis=-1)
 
 
+@jax.jit
 def transform_colors(parameters: jax.Array, colors: jax.Array) -> jax.Array:
     """Return transformed colours [..., 3] in [0, 1].
 
@@ -67,11 +68,6 @@ def transform_colors(parameters: jax.Array, colors: jax.Array) -> jax.Array:
     values = colors ** jnp.exp(gamma) * jnp.exp(gain + warmth * jnp.array([1, 0, -1], jnp.float32))
     grey = (values * LUMA).sum(axis=-1, keepdims=True)
     return jnp.clip(grey + jnp.exp(saturation) * (values - grey), 0, 1)
-
-
-@jax.jit
-def _transformed(clouds: PointClouds, parameters: jax.Array) -> PointClouds:
-    return dataclasses.replace(clouds, colors=transform_colors(parameters, clouds.colors))
 
 
 @jax.jit
@@ -100,10 +96,10 @@ def objective(
 
     def total(parameters: NDArray[np.floating]) -> float:
         transform = jnp.asarray(parameters, jnp.float32)
-        values = [
-            (count, _uncertainties(criterion(_transformed(clouds, transform)), known_before))
-            for count, clouds, known_before in chunks
-        ]
+        values = []
+        for count, clouds, known_before in chunks:
+            transformed = dataclasses.replace(clouds, colors=transform_colors(transform, clouds.colors))
+            values.append((count, _uncertainties(criterion(transformed), known_before)))
         return float(sum(np.asarray(value)[:count].sum() for count, value in values))
 
     return total
