@@ -4,6 +4,7 @@ Names are imported when they are first used, so that importing the package does 
 """
 
 import importlib.metadata
+import pkgutil
 from typing import TYPE_CHECKING, Any
 
 from thor2_jax.config import DESCRIPTOR_VERSION as DESCRIPTOR_VERSION
@@ -54,23 +55,19 @@ else:
         "transformers": ("Tops2Transformer", "TopsTransformer"),
         "types": ("Descriptors", "Diagrams", "Parameters", "PointClouds", "Strips"),
     }
-    _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-    __all__ = sorted([*_MODULE_OF, "DESCRIPTOR_VERSION", "DescriptorConfig", "InputError", "Relaxation"])
-    _SUBMODULES = {name.partition(".")[0] for name in _MODULES}
-    _SUBMODULES |= {"capacity", "client", "export", "persistence", "plot", "testing"}
+    _PATHS = {name: f"thor2_jax.{module}:{name}" for module, names in _MODULES.items() for name in names}
+    __all__ = sorted([*_PATHS, "DESCRIPTOR_VERSION", "DescriptorConfig", "InputError", "Relaxation"])
+    _SUBMODULES = {"capacity", "client", "export", "persistence", "plot", "testing"}
+    _PATHS |= {name: f"thor2_jax.{name}:" for name in _SUBMODULES | {each.partition(".")[0] for each in _MODULES}}
 
     def __getattr__(name: str) -> Any:
-        if name in _MODULE_OF:
-            value = getattr(importlib.import_module(f"thor2_jax.{_MODULE_OF[name]}"), name)
-        elif name in _SUBMODULES:
-            value = importlib.import_module(f"thor2_jax.{name}")
-        else:
+        if name not in _PATHS:
             raise AttributeError(f"module 'thor2_jax' has no attribute {name!r}")
-        globals()[name] = value
-        return value
+        globals()[name] = pkgutil.resolve_name(_PATHS[name])
+        return globals()[name]
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *_MODULE_OF, *_SUBMODULES})
+        return sorted({*globals(), *_PATHS})
 
 
 __version__ = "0.1.0"
