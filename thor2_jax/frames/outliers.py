@@ -238,13 +238,11 @@ def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
         Indices of the points to keep, in increasing order, at least one if n > 0; and whether the neighbour rule was
         skipped because it would have dropped more than half of the object, as if it is small or seen through gaps.
     """
-    kept = np.arange(len(points))
     if len(points) == 0:
-        return kept, False
+        return np.arange(0), False
     planes = points.T.astype(np.float64, order="C")
     cell, shape = _grid(planes)
     among = _among_others(planes, cell, shape)
     relaxed = 2 * int(among.sum()) < len(points)
-    if not relaxed:
-        kept = kept[among]
+    kept = np.flatnonzero(among | relaxed)
     return kept[_in_large_piece(cell[kept], shape)], relaxed
