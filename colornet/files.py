@@ -8,7 +8,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,7 +25,6 @@ __all__ = [
     "read_file",
     "remove_leftovers",
     "temporary_directory",
-    "write_arrays",
 ]
 
 MAX_ARRAY_BYTES = 2**26
@@ -134,18 +133,8 @@ def remove_leftovers(directory: Path) -> None:
                     shutil.rmtree(path)
 
 
-def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays to `path` (npz), compressed and atomically; equal arrays give equal bytes.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    with atomic_write(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(stream, **dict[str, Any](arrays))
-
-
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays that `write_arrays` wrote.
+    """Read the arrays of an npz file.
 
     Raises:
         OSError: the file cannot be read.

@@ -13,12 +13,13 @@ import dataclasses
 import functools
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from colornet.colors import GRID_SIZE, grid_index
-from colornet.files import read_arrays, write_arrays
+from colornet.files import atomic_write, read_arrays
 
 __all__ = ["ColorNetwork"]
 
@@ -128,12 +129,14 @@ class ColorNetwork:
         return digest.hexdigest()
 
     def save(self, path: str | Path) -> None:
-        """Write the network to a file (npz) that `load` reads, atomically.
+        """Write the network to a file (npz, compressed) that `load` reads, atomically; equal networks give equal bytes.
 
         Raises:
             OSError: the file cannot be written.
         """
-        write_arrays(path, {name: np.asarray(value) for name, value in vars(self).items() if name in _FIELDS})
+        arrays: dict[str, Any] = {name: value for name, value in vars(self).items() if name in _FIELDS}
+        with atomic_write(path) as temporary, open(temporary, "wb") as stream:
+            np.savez_compressed(stream, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> "ColorNetwork":

@@ -12,7 +12,7 @@ from failures import Pickled
 from processes import finish_programs, start_program
 
 import colornet
-from colornet.files import read_arrays, write_arrays
+from colornet.files import read_arrays
 
 NETWORK = colornet.load_default()
 CONTENTS = {field.name: getattr(NETWORK, field.name) for field in dataclasses.fields(NETWORK)}
@@ -79,7 +79,7 @@ def test_inconsistent_contents_are_rejected(tmp_path: Path, change: dict[str, An
         dataclasses.replace(NETWORK, **change)
     assert str(direct.value).startswith(message)
     path = tmp_path / "network.npz"
-    write_arrays(path, {name: np.asarray(value) for name, value in {**CONTENTS, **change}.items()})
+    np.savez(path, **{**CONTENTS, **change})
     with pytest.raises(ValueError) as loaded:
         colornet.load(path)
     assert str(loaded.value).startswith(str(path)) and str(loaded.value).endswith(str(direct.value))
@@ -96,16 +96,16 @@ def test_damaged_and_foreign_files_raise_one_line(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(ValueError, match=rf"^{path} is damaged.*$"):
             colornet.load(path)
-    write_arrays(path, {"something": np.zeros(3)})
+    np.savez(path, something=np.zeros(3))
     with pytest.raises(ValueError, match=r"\['something'\]"):
         colornet.load(path)
 
 
 def test_arrays_up_to_the_limit_are_read(tmp_path: Path) -> None:
     size = 2**26 - 128  # an array's header takes 128 bytes
-    write_arrays(tmp_path / "file.npz", {"zeros": np.zeros(size, np.uint8)})
+    np.savez_compressed(tmp_path / "file.npz", zeros=np.zeros(size, np.uint8))
     assert read_arrays(tmp_path / "file.npz")["zeros"].shape == (size,)
-    write_arrays(tmp_path / "file.npz", {"zeros": np.zeros(size + 1, np.uint8)})
+    np.savez_compressed(tmp_path / "file.npz", zeros=np.zeros(size + 1, np.uint8))
     with pytest.raises(ValueError, match="damaged"):
         read_arrays(tmp_path / "file.npz")
 
