@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.font_manager import fontManager, get_font
 
-from thor2_jax.files import atomic_write
+from thor2_jax.files import write_bytes
 from thor2_jax.printable import escape_characters
 
 __all__ = ["name_style", "plain_text", "png_bytes", "save_figure"]
@@ -26,8 +26,7 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, **_PNG)
+    write_bytes(path, png_bytes(figure))
 
 
 def png_bytes(figure: Figure) -> bytes:
