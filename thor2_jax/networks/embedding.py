@@ -289,9 +289,8 @@ class Embedding:
             "sizes": dataclasses.asdict(self.sizes),
             "classes": list(self.classes),
             "distractors": self.distractors,
+            **({"further": len(self.further)} if self.further else {}),
         }
-        if self.further:
-            about["further"] = len(self.further)
         arrays = model_arrays(self.model)
         for number, model in enumerate(self.further):
             arrays |= model_arrays(model, _FURTHER.format(number))
@@ -346,9 +345,8 @@ class Embedding:
             embedding = cls(config, network, sizes, model, classes, distractors)
             prefixes = map(_FURTHER.format, range(count))
             further = tuple(model_from_arrays(embedding.create_further, arrays, prefix) for prefix in prefixes)
-        file, references = path.with_name(REFERENCES_FILE), None
-        if file.is_file():
-            references = References.load(file, content_digest([content]), embedding.size)
+        file = path.with_name(REFERENCES_FILE)
+        references = References.load(file, content_digest([content]), embedding.size) if file.is_file() else None
         embedding = dataclasses.replace(embedding, further=further, references=references)
         # The fingerprint is computed from the file itself, which another version of this software may have written.
         embedding.__dict__["_content"] = content
