@@ -137,12 +137,10 @@ def infer(
     names = model.chosen_classifiers() if classifiers is None else classifiers
     probabilities = {name: model.classifiers[name](oriented) for name in names}
     surfaces = model.run.surfaces if EMBEDDING in probabilities else None
-    if clouds is None or not (embeds or surfaces):
-        return Inference(oriented.overflow, probabilities)
-    samples = sample_points(clouds)
-    if surfaces is not None:
+    samples = None if clouds is None or not (embeds or surfaces) else sample_points(clouds)
+    if surfaces is not None and samples is not None:
         probabilities[EMBEDDING] = _with_evidence_in_threads(probabilities[EMBEDDING], surfaces, samples)
-    if not embeds:
+    if clouds is None or not embeds:
         return Inference(oriented.overflow, probabilities)
     embedding, run = model.embedding, model.run
     # Neither the homology nor the number of looks changes a look.
