@@ -89,10 +89,8 @@ def _sublevel_diagrams(heights: jax.Array, edges: jax.Array | None) -> Diagrams:
     heights = jnp.where(jnp.isfinite(heights), heights, jnp.inf)
     left, right = heights[..., :-1], heights[..., 1:]
     lowest = jnp.where(left >= right, left, right)
-    if edges is None:
-        edges = lowest
-    else:
-        edges = jnp.where(edges > lowest, edges.astype(heights.dtype), jnp.where(jnp.isnan(edges), jnp.inf, lowest))
+    edges = lowest if edges is None else edges
+    edges = jnp.where(edges > lowest, edges.astype(heights.dtype), jnp.where(jnp.isnan(edges), jnp.inf, lowest))
     if edges.size == 0:
         return Diagrams(jnp.zeros_like(heights), jnp.zeros_like(heights), jnp.zeros(heights.shape, bool))
     index = jnp.vectorize(_death_edges, signature="(n),(m)->(n)")(*jax.lax.stop_gradient((heights, edges)))
