@@ -72,13 +72,11 @@ def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np
 
     Strips are numbered within their slice, so that the numbers hold for any leading axes that `vmap` adds.
     """
-    births, edges, occupied = (np.asarray(a) for a in (births, edges, occupied))
-    shape = np.broadcast_shapes(births.shape, edges.shape, occupied.shape)
-    strip = np.flatnonzero(np.broadcast_to(occupied, shape)).astype(np.int32)
-    birth_index, death_index = np.full((2, int(np.prod(shape))), -1, np.int32)
+    births, edges, occupied = np.broadcast_arrays(births, edges, occupied)
+    strip = np.flatnonzero(occupied).astype(np.int32)
+    birth_index, death_index = np.full((2, occupied.size), -1, np.int32)
     if len(strip):
-        vertex_at = np.broadcast_to(births, shape).reshape(-1)[strip].astype(np.float64)
-        edge_at = np.broadcast_to(edges, shape).reshape(-1)[strip].astype(np.float64)
+        vertex_at, edge_at = (a.reshape(-1)[strip].astype(np.float64) for a in (births, edges))
         first = np.arange(len(strip), dtype=np.int32) * 2
         tree = _load_gudhi().SimplexTree()
         tree.insert_batch(np.concatenate([first, first + 1])[None], np.concatenate([vertex_at, vertex_at]))
@@ -86,8 +84,9 @@ def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np
         tree.compute_persistence(min_persistence=-1)
         pairs = tree.flag_persistence_generators()[0]  # rows: birth vertex, the death edge's two vertices
         death = strip[pairs[:, 1] // 2]
-        birth_index[death], death_index[death] = strip[pairs[:, 0] // 2] % shape[-1], death % shape[-1]
-    return birth_index.reshape(shape), death_index.reshape(shape)
+        n_strips = occupied.shape[-1]
+        birth_index[death], death_index[death] = strip[pairs[:, 0] // 2] % n_strips, death % n_strips
+    return birth_index.reshape(occupied.shape), death_index.reshape(occupied.shape)
 
 
 def cumulative_at_edges(centres: jax.Array, variance: ArrayLike, edges: jax.Array) -> jax.Array:
