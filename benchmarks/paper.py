@@ -29,9 +29,8 @@ from benchmarks.paper_report import draw_claims, report_text
 from benchmarks.timing import print_step
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, write_text
-from training.baselines.architectures import crop_size, pretrained_files
 from training.baselines.baseline import baseline_file
-from training.baselines.job import check_baselines
+from training.baselines.job import check_baselines, crop_size, pretrained_files
 from training.evaluation.runs import load_runs
 from training.objects.meshes import find_meshes
 from training.readers.frames import FrameFolder

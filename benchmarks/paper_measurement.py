@@ -21,8 +21,8 @@ from thor2_jax.files import json_digest
 from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
 from thor2_jax.recognizer import DescribedFrame
-from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import BaselineInputs, Predictor
+from training.baselines.image_baselines import ARCHITECTURES
 from training.baselines.job import CLOUD_BASELINES, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset

@@ -235,14 +235,14 @@ def small_buckets(module_patch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def small_transformers(module_patch: pytest.MonkeyPatch) -> None:
     """Give the vision transformers one block and, but DINOv2, narrow tokens and images of 32 pixels."""
-    from training.baselines import architectures
-    from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY
+    from training.baselines import image_baselines
+    from training.baselines import image_networks as networks
 
     for name in ("rgbd-vit-small", "vit-cnn-small"):
-        network, vit = architectures.ARCHITECTURES[name], dataclasses.replace(VIT_TINY, width=96, depth=1)
+        network, vit = image_baselines.ARCHITECTURES[name], dataclasses.replace(networks.VIT_TINY, width=96, depth=1)
         small = dataclasses.replace(network, create=functools.partial(network.create, vit=vit, size=32), size=32)
-        module_patch.setitem(architectures.ARCHITECTURES, name, small)
-    module_patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
+        module_patch.setitem(image_baselines.ARCHITECTURES, name, small)
+    module_patch.setattr(networks, "VIT_DINOV2_SMALL", dataclasses.replace(networks.VIT_DINOV2_SMALL, depth=1))
 
 
 @pytest.fixture(scope="module")

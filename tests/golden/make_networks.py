@@ -2,7 +2,7 @@
 
     pip install torch torchvision timm && python tests/golden/make_networks.py
 
-Run it in an environment of its own: the project does not need torch. `tests/training/baselines/test_architectures.py`
+Run it in an environment of its own: the project does not need torch. `tests/training/baselines/test_image_networks.py`
 compares the networks of `training.baselines` with these outputs. The weights come from `network_weights` by the names
 of the PyTorch tensors, and everything is computed in float64.
 """

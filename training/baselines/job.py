@@ -6,19 +6,29 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from flax import nnx
+
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import locked, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines import cloud_baselines as clouds
 from training.baselines import image_baselines as images
-from training.baselines import thor
-from training.baselines.architectures import ARCHITECTURES, TEMPLATES, check_weights, pretrained_files
 from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file
+from training.baselines.image_baselines import ARCHITECTURES, TEMPLATES
 from training.storage.jobs import Progress, add_prefix
 from training.train_run import find_run_directories
 from training.views.normalized_views import ViewSource
 
-__all__ = ["CLOUD_BASELINES", "TITLES", "TrainedBaseline", "check_baselines", "load_baselines", "train_baselines"]
+__all__ = [
+    "CLOUD_BASELINES",
+    "TITLES",
+    "TrainedBaseline",
+    "check_baselines",
+    "crop_size",
+    "load_baselines",
+    "pretrained_files",
+    "train_baselines",
+]
 
 CLOUD_BASELINES = ("thor", "forest", "pointnet")
 """Baselines on point clouds."""
@@ -43,7 +53,7 @@ TITLES = {
 Load = Callable[[Mapping[str, Any], TrainedRun], Predictor]
 
 _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
-    "thor": (thor.fit_thor, thor.load_thor),
+    "thor": (clouds.fit_thor, clouds.load_thor),
     "forest": (clouds.fit_forest, clouds.load_forest),
     "pointnet": (clouds.fit_pointnet, clouds.load_pointnet),
     **{name: (images.fit_image_network, functools.partial(images.load_image_network, name)) for name in ARCHITECTURES},
@@ -51,6 +61,37 @@ _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
 }
 """Name -> function that fits a baseline, and function that builds it from its arrays and run. The second one raises
 KeyError or ValueError for unsuitable arrays."""
+
+
+def pretrained_files(name: str) -> list[str]:
+    """Return the files of pretrained weights that a baseline reads, without the suffix; most baselines read none."""
+    return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
+
+
+def crop_size(names: Sequence[str], weights: bool) -> int | None:
+    """Return the largest side in pixels of the crops on which baselines are trained; None if they need no crops.
+
+    Args:
+        names: names of the baselines.
+        weights: whether there are pretrained weights; templates then use DINOv2, which reads large crops.
+    """
+    readers = (name if weights or name != TEMPLATES else "rgbd-vit-small" for name in names)
+    return max((ARCHITECTURES[name].size for name in readers if name in ARCHITECTURES), default=None)
+
+
+def check_weights(directory: Path, name: str) -> dict[str, str]:
+    """Read the files of a baseline's pretrained weights, without keeping them.
+
+    Returns:
+        Name of each file -> its SHA-256; empty for baselines that read none.
+
+    Raises:
+        InputError: a file is missing, damaged or of another architecture.
+    """
+    if not pretrained_files(name):
+        return {}
+    architecture = ARCHITECTURES[name]
+    return architecture.load_weights(nnx.eval_shape(lambda: architecture.build(2, 0)), directory)
 
 
 def check_baselines(names: Sequence[str], weights: Path | None, out: Path) -> tuple[str, ...]:

@@ -24,8 +24,8 @@ from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.networks.networks import EMBEDDING
 from thor2_jax.printable import first_names
 from thor2_jax.recognizer import DescribedFrame, Recognizer
-from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import BaselineInputs, baseline_file
+from training.baselines.image_baselines import ARCHITECTURES
 from training.baselines.job import TITLES, TrainedBaseline, load_baselines
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, GALLERY
 from training.readers.labelled import named_path, path_ends, sequence_of

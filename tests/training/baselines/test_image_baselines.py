@@ -15,12 +15,10 @@ from small_runs import save_trained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run
-from training.baselines import architectures
 from training.baselines import baseline as module
-from training.baselines.architectures import ARCHITECTURES, crop_size, pretrained_files, tensors
 from training.baselines.baseline import BaselineInputs, StoredBaseline, baseline_file
-from training.baselines.image_baselines import check_backbone, compare
-from training.baselines.job import load_baselines, train_baselines
+from training.baselines.image_baselines import ARCHITECTURES, check_backbone, compare, network_inputs, tensors
+from training.baselines.job import crop_size, load_baselines, pretrained_files, train_baselines
 from training.protocol import DEFAULT
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops
@@ -182,7 +180,7 @@ def test_nearest_template_has_the_largest_cosine() -> None:
 
 def test_inputs_are_scaled_and_the_background_is_zero() -> None:
     crops = crops_of(0, 2, 12)
-    color, normals = (np.asarray(values) for values in architectures.network_inputs(crops.color, crops.normals))
+    color, normals = (np.asarray(values) for values in network_inputs(crops.color, crops.normals))
     mask = crops.normals.any(axis=-1)
     assert not color[~mask].any() and not normals[~mask].any()
     for values, pixel in ((color, np.array([200, 30, 30]) / 255), (normals, np.array([0.5, 0.5, 0]))):

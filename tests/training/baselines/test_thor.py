@@ -13,7 +13,7 @@ from small_runs import random_classifier
 import thor2_jax as thor2
 from thor2_jax.networks.networks import model_arrays
 from training.baselines.baseline import BaselineInputs
-from training.baselines.thor import VIEW_TYPES, camera_types, load_thor, view_types
+from training.baselines.cloud_baselines import VIEW_TYPES, camera_types, load_thor, view_types
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 

@@ -14,9 +14,18 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
-from training.baselines.architectures import load_backbone, resampled_positions, tensors
-from training.baselines.cnn import DENSENET_161, GRU, DenseNet, ResNet18
-from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, ViT
+from training.baselines.image_baselines import load_backbone, resampled_positions, tensors
+from training.baselines.image_networks import (
+    DENSENET_161,
+    GRU,
+    VIT_BASE,
+    VIT_DINOV2_SMALL,
+    VIT_TINY,
+    VIT_TINY_4,
+    DenseNet,
+    ResNet18,
+    ViT,
+)
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 sys.path.append(str(GOLDEN))
