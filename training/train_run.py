@@ -41,8 +41,7 @@ from thor2_jax.networks.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
 from training.embedding.distractors import Distractors
 from training.embedding.fit import RUN_SIZES, fit_embedding
-from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
-from training.fitting.fit import FitContext, fit
+from training.fitting.fit import FitContext, fit, fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.loop import Checkpoints, EpochMetrics, fit_progress, wait_for_all
 from training.fitting.samples import OF_EMBEDDING, Form, Samples, sample_views
 from training.protocol import Protocol, Stage

@@ -21,7 +21,7 @@ from thor2_jax.types import Cloud, PointClouds
 from training import train_run as module
 from training.embedding import distractors
 from training.embedding.distractors import Distractors, render_clouds
-from training.fitting.calibration import fit_calibration
+from training.fitting.fit import fit_calibration
 from training.fitting.loop import Checkpoints, FitOptions
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of

@@ -20,8 +20,7 @@ from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks.networks import model_arrays
 from training import train_run as module
 from training.evaluation.runs import load_runs
-from training.fitting.calibration import fit_temperature, sample_probabilities
-from training.fitting.fit import FitContext
+from training.fitting.fit import FitContext, fit_temperature, sample_probabilities
 from training.fitting.loop import Checkpoints, FitOptions
 from training.fitting.samples import sample_views
 from training.protocol import Protocol

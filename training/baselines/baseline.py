@@ -23,8 +23,7 @@ from thor2_jax.files import content_digest, json_digest, pack_arrays, read_file,
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import Compiled
 from thor2_jax.recognizer import DescribedFrame
-from training.fitting.calibration import fit_temperature
-from training.fitting.fit import FitState, network_step
+from training.fitting.fit import FitState, fit_temperature, network_step
 from training.fitting.loop import Checkpoints, FitOptions, Steps, fit_progress, run_epochs
 from training.storage.jobs import Progress
 from training.views.crops import ViewCrops, rgbd_crop

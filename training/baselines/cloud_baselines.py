@@ -35,8 +35,7 @@ from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import MLP, Linear, model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs, FitTask, Predictor, StoredBaseline, compiled_network, in_batches
-from training.fitting.calibration import sample_probabilities
-from training.fitting.fit import FitContext, fit
+from training.fitting.fit import FitContext, fit, sample_probabilities
 from training.fitting.loop import Checkpoints, EpochMetrics
 from training.fitting.samples import MIRRORS, sample_views
 from training.rendering.camera import view_angles

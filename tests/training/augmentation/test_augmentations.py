@@ -13,8 +13,15 @@ from scipy.special import ndtr
 
 from thor2_jax.files import json_digest
 from thor2_jax.frames.frames import backproject
-from training.augmentation.augmentations import KINDS, Augmentations, augment
-from training.augmentation.masks import Base, Occlusion, Segmentation, _silhouettes
+from training.augmentation.augmentations import (
+    KINDS,
+    Augmentations,
+    Base,
+    Occlusion,
+    Segmentation,
+    _silhouettes,
+    augment,
+)
 from training.augmentation.sensing import Illumination, Registration
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import TRAINING_CAMERA, RayCaster, RenderedView, camera_pose
@@ -189,7 +196,7 @@ def test_edges_are_straight_or_outlines(monkeypatch: pytest.MonkeyPatch) -> None
         direction = places[hidden].mean(axis=0)
         along = places @ direction / np.linalg.norm(direction)
         assert along[hidden].min() > along[~hidden].max() - 3
-    monkeypatch.setattr("training.augmentation.masks._silhouettes", lambda: [disc[::3, ::3]])
+    monkeypatch.setattr("training.augmentation.augmentations._silhouettes", lambda: [disc[::3, ::3]])
     occluded = augmented_view(view, 0, occlusion=Occlusion((0.33, 0.35), none=0, straight=0, nearer=(1.2, 1.2)))
     spread = np.linalg.eigvalsh(np.cov(places[occluded.depth[disc] == 0].T)) ** 0.5
     assert spread == pytest.approx([1.2 * 26 * 2 / 1.365 / 2] * 2, rel=0.05)  # a disc of 26 pixels of 2 mm, nearer

@@ -17,7 +17,7 @@ from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.networks.networks import MLP, Feature, feature_of, input_size
 from thor2_jax.types import Cloud
-from training.fitting import calibration
+from training.fitting import fit as module
 from training.fitting.fit import FitContext
 from training.fitting.samples import MIRRORS, sample_views
 from training.views.normalized_views import MemoryViews, padded_batches
@@ -29,14 +29,14 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=8, 
 
 @pytest.mark.parametrize("feature", ["ce", pytest.param("tops2", marks=pytest.mark.slow)])
 def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calibration, "SAMPLES_PER_BATCH", 3)
+    monkeypatch.setattr(module, "SAMPLES_PER_BATCH", 3)
     views = MemoryViews({"brick": random_clouds(0, [90] * 2), "stick": random_clouds(1, [90] * 2)}, CONFIG)
     samples, _ = sample_views(views, NETWORK, CONFIG)
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 3, rngs=nnx.Rngs(0))  # the third class has no samples
     rows = np.array([7, 0, 7, 3, 5])
     monkeypatch.setitem(sys.modules, "gudhi", None)  # a fit does not need it, whatever the descriptor of the run
     context = FitContext(feature, NETWORK, dataclasses.replace(CONFIG, homology="gudhi"))
-    probabilities = calibration.sample_probabilities(model, samples, rows, context)
+    probabilities = module.sample_probabilities(model, samples, rows, context)
     probabilities_of = jax.jit(lambda described: jax.nn.softmax(model(feature_of(described, feature))))
     expected = []
     for index in range(2):
@@ -46,7 +46,7 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
             described = thor2.describe_aligned(aligned, NETWORK, CONFIG)
             expected.append(np.asarray(probabilities_of(described))[:2])
     np.testing.assert_allclose(probabilities, np.concatenate(expected)[rows], atol=1e-5)
-    assert calibration.sample_probabilities(model, samples, rows[:0], context).shape == (0, 3)
+    assert module.sample_probabilities(model, samples, rows[:0], context).shape == (0, 3)
 
 
 @pytest.mark.parametrize("temperature", [0.4, 1.0, 3.0])
@@ -55,12 +55,12 @@ def test_known_temperature_is_recovered(temperature: float) -> None:
     logits = rng.normal(0, 2, (20_000, 5))
     truth = (softmax(logits, axis=1).cumsum(axis=1) < rng.random((20_000, 1))).sum(axis=1)
     scaled = softmax(logits * temperature, axis=1)
-    assert calibration.fit_temperature(scaled, truth) == pytest.approx(temperature, rel=0.05)
+    assert module.fit_temperature(scaled, truth) == pytest.approx(temperature, rel=0.05)
 
 
 def test_probabilities_of_zero() -> None:
     probabilities = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]], np.float32)
-    assert 1 < calibration.fit_temperature(probabilities, np.array([0, 1, 1])) <= 100
+    assert 1 < module.fit_temperature(probabilities, np.array([0, 1, 1])) <= 100
 
 
 Views = list[tuple[int, Cloud]]
@@ -79,8 +79,8 @@ def fit(fused: np.ndarray, embedded: np.ndarray, held_out: Views) -> tuple[Calib
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calibration, "infer_clouds", lambda *_: inference)
-        return calibration.fit_calibration(run, held_out)
+        patch.setattr(module, "infer_clouds", lambda *_: inference)
+        return module.fit_calibration(run, held_out)
 
 
 def test_confidence_separates_and_keeps_its_share(held_out: Views) -> None:
@@ -119,10 +119,10 @@ def test_held_out_views_have_the_looks_of_the_run(held_out: Views, monkeypatch: 
     """The threshold is that of the answers to all clouds in one batch, in their own order."""
     run = untrained_embedding_run(("a", "b"), config=dataclasses.replace(SMALL_CONFIG, looks=4))
     assert run.embedding is not None
-    monkeypatch.setattr(calibration, "KEPT", 0.75)  # the lowest confidence is the same with one look
+    monkeypatch.setattr(module, "KEPT", 0.75)  # the lowest confidence is the same with one look
     sizes = np.random.default_rng(2).permutation(np.arange(100, 140))
     views = [(label, (xyz[:n], rgb[:n])) for n, (label, (xyz, rgb)) in zip(sizes, held_out, strict=True)]
-    fitted, accuracy = calibration.fit_calibration(run, views)
+    fitted, accuracy = module.fit_calibration(run, views)
     assert fitted is not None
     ((_, clouds),) = padded_batches([cloud for _, cloud in views])
     thresholds = []
