@@ -94,13 +94,9 @@ class Protocol:
             # Rendering distractors takes no time if they are in the cache.
             of_fold |= {Stage.RENDER_DISTRACTORS: 0.0, Stage.DESCRIBE_EMBEDDED: DESCRIBE_SHARE}
             of_fold |= {Stage.FIT_NETWORKS: fit_share, Stage.CALIBRATE: CALIBRATE_SHARE}
-        folds = range(self.folds)
         described = {Stage.DESCRIBE: DESCRIBE_SHARE} if self.classifiers else {}
-        return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}
-
-    def of_fold(self, stage: str, fold: int) -> str:
-        """Return the name of a stage in this fold."""
-        return stage if self.folds == 1 else f"fold {fold}: {stage}"
+        prefixes = [""] if self.folds == 1 else [f"fold {fold}: " for fold in range(self.folds)]
+        return described | {prefix + stage: share for prefix in prefixes for stage, share in of_fold.items()}
 
     def record(self, digest: str) -> dict[str, Any]:
         """Return everything that determines the run, in the form in which JSON stores it.

@@ -46,7 +46,7 @@ from training.fitting.loop import Checkpoints, EpochMetrics, fit_progress, wait_
 from training.fitting.samples import OF_EMBEDDING, Form, Samples, sample_views
 from training.protocol import Protocol, Stage
 from training.reports.plots import draw_curves
-from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, of_stage
+from training.storage.jobs import Progress, add_prefix, begin_job, check_begun, check_same_job, of_stage
 from training.views.normalized_views import ViewSource, check_classes, fold_of_views
 
 __all__ = ["VIEWS", "check_out", "check_trained", "find_run_directories", "finished_record", "is_finished", "train_run"]
@@ -208,7 +208,8 @@ def train_run(
         runs = []
         for fold in range(settings.folds):
             held_out = None if parts == 1 else fold_of == fold
-            runs.append(_Fold(settings, source, out, fold, samples, held_out, progress, enrolled or {}).train())
+            shown = progress if settings.folds == 1 else add_prefix(progress, f"fold {fold}")
+            runs.append(_Fold(settings, source, out, fold, samples, held_out, shown, enrolled or {}).train())
         wait_for_all("trained")
         if first:
             remove_written(out / CHECKPOINTS, r"begun\.json", r"\.lock", r"(fold-[0-9]+|distractors)/.*")
@@ -228,7 +229,10 @@ def _sample_classes(source: ViewSource, settings: Protocol, progress: Progress) 
 
 
 class _Fold(NamedTuple):
-    """One fold of a training: the arguments of `train_run`, the fold's number, all samples, and which are held out."""
+    """One fold of a training: the arguments of `train_run`, the fold's number, all samples, and which are held out.
+
+    The stages of `progress` have the fold as a prefix, if there are several.
+    """
 
     settings: Protocol
     source: ViewSource
@@ -250,7 +254,7 @@ class _Fold(NamedTuple):
         if not (directory / RUN_FILE).is_file():
             run = self.fit_classifiers()
             if jax.process_index() == 0:
-                _publish(self.complete_run(run), self.scratch / "run", directory, self.enrolled)
+                self.publish(self.complete_run(run), directory)
             wait_for_all("published")
         return load_run(directory)
 
@@ -262,7 +266,7 @@ class _Fold(NamedTuple):
         temperatures: dict[Feature, float] = {}
         for name in settings.classifiers:
             context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
-            shown = fit_progress(self.report, f"fit {name}", settings.fit.epochs)
+            shown = fit_progress(self.progress, f"fit {name}", settings.fit.epochs)
             fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)
             classifiers[name], best_epochs[name] = fitted
             if self.held_out is not None:
@@ -278,9 +282,9 @@ class _Fold(NamedTuple):
         if settings.distractors is not None:
             embedding, held_out = self.fit_embedding(settings.distractors)
             run = dataclasses.replace(run, embedding=embedding, surfaces=self.source.surfaces)
-            self.report(Stage.CALIBRATE, 0, 1)
+            self.progress(Stage.CALIBRATE, 0, 1, "")
             calibration, accuracy[EMBEDDING] = fit_calibration(run, held_out)
-            self.report(Stage.CALIBRATE, 1, 1)
+            self.progress(Stage.CALIBRATE, 1, 1, "")
             confidence = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
         rows = read_metrics(self.out / METRICS)
         names = dict.fromkeys(row["classifier"] for row in rows)
@@ -302,11 +306,11 @@ class _Fold(NamedTuple):
         settings, checkpoints = self.settings, self.checkpoints(EMBEDDING)
         network, seed, classes = settings.network, settings.fit.seed, self.source.classes
         config = dataclasses.replace(settings.config, homology="closed_form")
-        scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, Stage.RENDER_DISTRACTORS)
+        scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.progress, Stage.RENDER_DISTRACTORS)
         others = distractors.samples(scratch, network, config, shown)
         label, view = self.samples.label[self.held_out], self.samples.view[self.held_out]
         kept = {index: np.unique(view[label == index]) for index in range(len(classes))}
-        shown = of_stage(self.report, Stage.DESCRIBE_EMBEDDED)
+        shown = of_stage(self.progress, Stage.DESCRIBE_EMBEDDED)
         samples, known = sample_views(self.source, network, config, OF_EMBEDDING, seed, shown, kept)
         unknown = distractors.held_out_clouds(len(classes))
         samples = distractors.add_fitted(samples, others, len(classes))
@@ -318,7 +322,7 @@ class _Fold(NamedTuple):
             distractors.epochs,
             checkpoints,
             RUN_SIZES,
-            fit_progress(self.report, Stage.FIT_NETWORKS, distractors.epochs),
+            fit_progress(self.progress, Stage.FIT_NETWORKS, distractors.epochs),
             classes,
             networks=distractors.networks,
             seed=seed,
@@ -333,9 +337,22 @@ class _Fold(NamedTuple):
             remove_later_metrics(*logged, checkpoints.last_epoch)
         return checkpoints
 
-    def report(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Show the progress of a stage of this fold."""
-        self.progress(self.settings.of_fold(stage, self.number), done, total, note)
+    def publish(self, run: TrainedRun, directory: Path) -> None:
+        """Write a run and its enrolled views, and move the files into `directory`; run.json is moved last."""
+        complete = self.scratch / "run"
+        shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed in this function
+        save_run(run, complete)
+        if self.enrolled and run.embedding is not None:
+            objects = ObjectGallery(run.classes, run.embedding)
+            objects.open(complete / GALLERY_DIRECTORY)
+            clouds = {name: CompactClouds.of(views) for name, views in self.enrolled.items()}
+            added = {name: embedded_object(run.embedding, each, "frames") for name, each in clouds.items()}
+            objects.add(added, extend=True)
+        files = [path for path in complete.rglob("*") if path.is_file()]
+        for path in sorted(files, key=lambda path: path.name == RUN_FILE):
+            place = directory / path.relative_to(complete)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            path.rename(place)
 
 
 def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, int]) -> dict[str, Any]:
@@ -348,23 +365,3 @@ def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, in
         if row["epoch"] == best_epochs.get(name) and row["held_out_accuracy"] is not None:
             held_out[name] = row["held_out_accuracy"]
     return {"kept_epochs": dict(best_epochs), "held_out_accuracy": held_out, "curves": curves}
-
-
-def _publish(
-    run: TrainedRun, complete: Path, directory: Path, enrolled: Mapping[str, Sequence[PreparedInstance]]
-) -> None:
-    """Write a run and its enrolled views to `complete` and move the files into `directory`; run.json is moved last."""
-    shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed in this function
-    save_run(run, complete)
-    if enrolled and run.embedding is not None:
-        objects = ObjectGallery(run.classes, run.embedding)
-        objects.open(complete / GALLERY_DIRECTORY)
-        clouds = {name: CompactClouds.of(views) for name, views in enrolled.items()}
-        objects.add(
-            {name: embedded_object(run.embedding, each, "frames") for name, each in clouds.items()}, extend=True
-        )
-    files = [path for path in complete.rglob("*") if path.is_file()]
-    for path in sorted(files, key=lambda path: path.name == RUN_FILE):
-        place = directory / path.relative_to(complete)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        path.rename(place)

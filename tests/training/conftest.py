@@ -50,7 +50,7 @@ def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
 
     def fit_embedding(fold: Any, distractors: Any) -> tuple[Embedding, list[Any]]:
         for stage in (Stage.RENDER_DISTRACTORS, Stage.DESCRIBE_EMBEDDED, Stage.FIT_NETWORKS):
-            fold.report(stage, 1, 1)
+            fold.progress(stage, 1, 1, "")
         fold.checkpoints("embedding").log(metrics())
         given, classes = fold.settings, fold.source.classes
         created = Embedding.create(given.config, given.network, train_run.RUN_SIZES, classes=classes, distractors=9)
