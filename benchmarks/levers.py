@@ -18,6 +18,7 @@ import argparse
 import dataclasses
 import json
 import math
+import re
 import shlex
 import subprocess
 import sys
@@ -37,7 +38,7 @@ from benchmarks.cameras import (
     measure,
     summarize,
 )
-from benchmarks.paper_report import markdown_table
+from benchmarks.paper import markdown_table
 from benchmarks.timing import print_step
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
@@ -74,11 +75,6 @@ class Lever:
     looks: int | None = 1
     fusion: str | None = "THOR2"
     rule: Rule = DEFAULT_RULE
-
-    @property
-    def views(self) -> str:
-        """Directory name of its views."""
-        return _slug(self.render)
 
     @property
     def training(self) -> str:
@@ -132,11 +128,8 @@ COLUMNS = {
 
 def _slug(options: str) -> str:
     """Return options as a directory name."""
-    words = shlex.split(options)
-    return (
-        "_".join("".join(c if c.isalnum() or c in "-." else "-" for c in word.strip("-")) for word in words)
-        or "default"
-    )
+    words = (re.sub(r"[^\w.-]|_", "-", word.strip("-")) for word in shlex.split(options))
+    return "_".join(words) or "default"
 
 
 class Table:
@@ -175,12 +168,7 @@ class Table:
         if not file.is_file():
             return None
         stored = json.loads(file.read_bytes())
-        if stored["lever"] != json.loads(json.dumps(dataclasses.asdict(lever))):
-            return None
-        return {
-            name: {metric: math.nan if value is None else value for metric, value in values.items()}
-            for name, values in stored["results"].items()
-        }
+        return stored["results"] if stored["lever"] == dataclasses.asdict(lever) else None
 
     def _cell_file(self, lever: Lever, seed: int) -> Path:
         return self.out / "cells" / _slug(shlex.quote(lever.name)) / f"seed-{seed}.json"
@@ -190,7 +178,7 @@ class Table:
         source = ["--meshes", str(self.options.meshes)]
         if self.options.names:
             source += ["--names", str(self.options.names)]
-        views, run = self.out / "views" / lever.views, self.out / "runs" / lever.training / f"seed-{seed}"
+        views, run = self.out / "views" / _slug(lever.render), self.out / "runs" / lever.training / f"seed-{seed}"
         workers = ["--workers", str(self.options.workers)]
         _thor2("render", *source, "--out", views, *workers, *shlex.split(f"{self.options.render} {lever.render}"))
         training = shlex.split(f"{self.options.train} {lever.train}")

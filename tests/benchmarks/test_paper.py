@@ -11,8 +11,8 @@ from commands import run_thor2
 from rendered_objects import write_meshes, write_scene
 
 from benchmarks import paper
+from benchmarks.paper import report_text
 from benchmarks.paper_measurement import CLAIMS, paired_difference
-from benchmarks.paper_report import report_text
 from training.baselines.job import TITLES
 from training.evaluation.answers import fusions
 

@@ -157,13 +157,14 @@ def group_by_attributes(
     return {values: np.array(groups[values], np.intp) for values in ordered}
 
 
-def summarize_runs(values: Sequence[float]) -> dict[str, Any]:
+def summarize_runs(values: Sequence[float | None]) -> dict[str, Any]:
     """Return the statistics of a value over several runs as a JSON table.
 
     `runs` is the number of runs with a finite value, `mean` their mean (None if there are none), and `std` their sample
     standard deviation (n - 1; None for fewer than two).
     """
-    finite: NDArray[Any] = np.array([value for value in values if np.isfinite(value)])
+    finite = np.array(values, np.float64)  # None becomes NaN
+    finite = finite[np.isfinite(finite)]
     return {
         "mean": float(finite.mean()) if len(finite) else None,
         "std": float(finite.std(ddof=1)) if len(finite) > 1 else None,
