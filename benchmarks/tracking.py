@@ -26,22 +26,19 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cameras import labelled_frames
-from thor2_jax.capacity import point_bucket
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.frames.frames import Intrinsics
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
-from thor2_jax.model.inference import answers, infer_clouds
+from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.model.inference import answers
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import FusedEvidence, Tracker, view_weight
 from thor2_jax.tracking.viewpoints import ViewTable, merge_views, next_view, transform
 from training.evaluation.scores import placement_accuracy, steadiness
-from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh
 from training.readers.labelled import LabelledFrame, sequence_of
 from training.rendering.camera import Camera
@@ -112,13 +109,8 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
 
 def probabilities_of(recognizer: Recognizer, instances: Sequence[PreparedInstance]) -> list[dict[str, Any]]:
     """Return classifier -> class probabilities [C] for each instance."""
-    computed: list[dict[str, Any]] = []
-    for start in range(0, len(instances), 16):
-        rows = instances[start : start + 16]
-        clouds = pack_instances(rows, 16, max(2048, point_bucket(max(len(each.points) for each in rows))))
-        values = jax.tree.map(np.asarray, infer_clouds(recognizer.model, clouds, answer_by="classifiers").probabilities)
-        computed += [{name: p[k] for name, p in values.items()} for k in range(len(rows))]
-    return computed
+    probabilities = recognizer.infer(instances, answer_by="classifiers")[1].probabilities
+    return [{name: values[row] for name, values in probabilities.items()} for row in range(len(instances))]
 
 
 def _fuse(recognizer: Recognizer, views: Sequence[tuple[PreparedInstance, Probabilities]]) -> NDArray[np.floating]:
@@ -199,12 +191,6 @@ def summarize_scenes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return summary
 
 
-def read_meshes(directory: Path, names: Path | None, classes: Sequence[str]) -> dict[str, TexturedMesh]:
-    """Return the meshes of the classes."""
-    paths = find_meshes(directory, names)
-    return {name: load_mesh(path) for name, path in paths.items() if name in classes}
-
-
 def main() -> None:
     """Measure the runs and scenes that are missing in the file, and print the summary."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -236,7 +222,8 @@ def main() -> None:
         missing = [seed for seed in seeds if str(seed) not in stored["scenes"]]
         if missing:
             recognizer = Recognizer.load(options.model[0])
-            meshes = read_meshes(options.meshes, options.names, recognizer.run.classes)
+            paths, classes = find_meshes(options.meshes, options.names), recognizer.run.classes
+            meshes = {name: load_mesh(path) for name, path in paths.items() if name in classes}
             table = view_table(recognizer, meshes)
             for seed in missing:
                 arc = np.radians(VIEWS * options.step)
