@@ -18,7 +18,6 @@ import dataclasses
 import functools
 import logging
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -46,9 +45,6 @@ from training.views.normalized_views import padded_batches
 __all__ = ["AUGMENTATIONS", "Distractors", "sample_objects", "samples_record"]
 
 OBJECTS_PER_TASK = 32
-
-SAMPLES = r"[0-9]{6}\.safetensors"
-"""Names of the files with the samples of a task."""
 
 SEED = 0
 """Seed of the views of objects and of their orientations: all runs share the distractors in the user's cache."""
@@ -287,8 +283,6 @@ class Distractors:
 MAX_STORED = 3
 """Number of directories of samples that are kept in the cache: those used most recently."""
 
-NAME = re.compile(r"distractors-[0-9a-f]{64}")
-
 log = logging.getLogger(__name__)
 
 
@@ -296,6 +290,6 @@ def _keep_newest(cache: Path, used: str) -> None:
     """Remove the samples in a cache that have not been used for the longest time."""
     with contextlib.suppress(OSError):  # the cache may be read-only
         os.utime(cache / used)
-        stored = [path for path in cache.iterdir() if NAME.fullmatch(path.name)]
+        stored = cache.glob("distractors-" + 64 * "[0-9a-f]")
         for path in sorted(stored, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_STORED:]:
-            remove_written(path, SAMPLES)
+            remove_written(path, r"[0-9]{6}\.safetensors")
