@@ -175,16 +175,14 @@ def run(data: Path, recognizer: Recognizer, bases: Sequence[str] = BASES) -> dic
     }
 
 
-def sound(folders: Sequence[Path], recognizer: Recognizer | None) -> dict[str, Any]:
+def sound(folder: Path, recognizer: Recognizer | None) -> dict[str, Any]:
     """Diagnose sound frames; return their number and the findings, which should be none."""
-    count, findings = 0, {}
-    for folder in folders:
-        for source in find_frames([folder]):
-            diagnosis = diagnose(source.files or source.read(), recognizer=recognizer)
-            count += 1
-            if diagnosis.findings:
-                findings[source.name] = [finding.message for finding in diagnosis.findings]
-    return {"frames": count, "with_findings": findings}
+    sources, findings = find_frames([folder]), {}
+    for source in sources:
+        diagnosis = diagnose(source.files or source.read(), recognizer=recognizer)
+        if diagnosis.findings:
+            findings[source.name] = [finding.message for finding in diagnosis.findings]
+    return {"frames": len(sources), "with_findings": findings}
 
 
 def main() -> None:
@@ -198,7 +196,7 @@ def main() -> None:
     report = run(options.data, recognizer)
     for folder in options.sound or []:
         knows = folder.startswith("frames/ycbv")
-        report.setdefault("sound", {})[folder] = sound([options.data / folder], recognizer if knows else None)
+        report.setdefault("sound", {})[folder] = sound(options.data / folder, recognizer if knows else None)
     text = json.dumps(report, indent=1) + "\n"
     print(text)
     if options.out:

@@ -10,7 +10,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -38,20 +38,13 @@ RULES: tuple[Rule, ...] = (DEFAULT_RULE, "max")
 TIMED_FRAMES = 5
 
 
-class Claim(NamedTuple):
-    """A claim of the paper: THOR2 is more accurate than another column."""
-
-    text: str
-    other: str
-
-
-CLAIMS = (
-    Claim("THOR2 above THOR", "THOR"),
-    Claim("colour helps: THOR2 above TOPS", "TOPS"),
-    Claim("THOR2 above CE + TOPS + TOPS2", "CE+TOPS+TOPS2"),
-    *(Claim(f"THOR2 above {TITLES[name]}", TITLES[name]) for name in (*ARCHITECTURES, "forest", "pointnet")),
-)
-"""Claims of the paper, and comparisons with baselines that are not in the paper: templates, forest, PointNet."""
+CLAIMS = {
+    "THOR": "THOR2 above THOR",
+    "TOPS": "colour helps: THOR2 above TOPS",
+    "CE+TOPS+TOPS2": "THOR2 above CE + TOPS + TOPS2",
+    **{TITLES[name]: f"THOR2 above {TITLES[name]}" for name in (*ARCHITECTURES, "forest", "pointnet")},
+}
+"""Column -> claim of the paper that THOR2 is more accurate; templates, forest and PointNet are not in the paper."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,12 +189,11 @@ def claims(runs: Sequence[Run], frames: Sequence[FrameAnswers], rule: Rule) -> l
     """Return the paired comparisons of THOR2 with the other columns."""
     correct, placement = correct_answers(runs, frames, rule)
     found = []
-    for claim in CLAIMS:
-        if "THOR2" in correct and claim.other in correct:
-            difference = paired_difference(correct["THOR2"], correct[claim.other], placement)
+    for other, claim in CLAIMS.items():
+        if "THOR2" in correct and other in correct:
+            difference = paired_difference(correct["THOR2"], correct[other], placement)
             found.append(
-                {"claim": claim.text, "other": claim.other, **dataclasses.asdict(difference)}
-                | {"verdict": difference.verdict}
+                {"claim": claim, "other": other, **dataclasses.asdict(difference), "verdict": difference.verdict}
             )
     return found
 

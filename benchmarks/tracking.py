@@ -88,22 +88,18 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
             if truth in recognizer.classes:
                 placement = f"{sequence_of(item.identifier)}/{truth}"
                 rows.append((placement, truth, alone[answer.label].name or "", answer.name or ""))
-    placement = np.unique([row[0] for row in rows], return_inverse=True)[1]
-    results: dict[str, Any] = {"instances": len(rows), "placements": int(placement.max() + 1)}
+    placed, truths, *given = map(np.array, zip(*rows, strict=True))
+    placements, placement = np.unique(placed, return_inverse=True)
+    results: dict[str, Any] = {"instances": len(rows), "placements": len(placements)}
     correct = {}
-    for index, name in ((2, "alone"), (3, "tracked")):
-        given = np.unique([row[index] for row in rows], return_inverse=True)[1]
-        correct[name] = np.array([row[index] == row[1] for row in rows])
+    for name, answered in zip(("alone", "tracked"), given, strict=True):
+        correct[name] = answered == truths
         results[name] = {
             "accuracy": placement_accuracy(placement, correct[name]),
-            "steadiness": steadiness(placement, given),
+            "steadiness": steadiness(placement, np.unique(answered, return_inverse=True)[1]),
         }
-    names = np.unique([row[0] for row in rows])
-    results["placements with lower accuracy"] = [
-        str(names[k])
-        for k in range(len(names))
-        if correct["tracked"][placement == k].mean() < correct["alone"][placement == k].mean()
-    ]
+    gain = correct["tracked"].astype(int) - correct["alone"]
+    results["placements with lower accuracy"] = placements[np.bincount(placement, gain) < 0].tolist()
     return results
 
 

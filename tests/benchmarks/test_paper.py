@@ -69,7 +69,7 @@ NAMES = ("soup_can_red", "yellow_box")
 
 def test_claims_name_columns() -> None:
     titles = fusions([*TITLES, "tops", "tops2", "ce"])
-    assert all(claim.other in titles for claim in CLAIMS) and "THOR2" in titles
+    assert CLAIMS.keys() <= titles.keys() and "THOR2" in titles
 
 
 def test_weights_are_checked_before_the_comparison_begins(tmp_path: Path) -> None:
