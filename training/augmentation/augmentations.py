@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import Intrinsics, pixel_points
+from thor2_jax.frames.frames import Intrinsics
 from thor2_jax.frames.outliers import PIECE_CELL, flying_pixels
 from training.augmentation import sensing
 from training.augmentation.sensing import FRAME_PIXEL, Range
@@ -234,9 +234,7 @@ def without_base(view: RenderedView, base: Base, rng: np.random.Generator) -> Re
         return view
     up = np.array([0.0, 0.0, 1.0]) if rng.random() < base.upright else rng.standard_normal(3)
     up /= np.linalg.norm(up)
-    depth = view.depth.take(pixels).astype(np.float32) / 1000
-    points = pixel_points(pixels, depth, view.depth.shape[1], view.intrinsics)
-    height = points @ (view.pose[:3, :3].T @ up).astype(np.float32)
+    height = view.frame.points(pixels).astype(np.float32) @ (view.pose[:3, :3].T @ up).astype(np.float32)
     low = height - height.min() < rng.uniform(*base.height)
     return view if low.mean() > MAX_CUT else view.without(pixels[low])
 

@@ -119,7 +119,7 @@ def through_camera(frame: RGBDFrame, camera: SimulatedCamera) -> RGBDFrame:
     rng = np.random.default_rng([zlib.crc32(camera.name.encode()), zlib.crc32(np.asarray(frame.depth).tobytes())])
     color = _color(frame.color, camera, rng)
     depth = _depth(frame.depth_m, camera, rng)
-    labels = None if frame.labels is None else _labels(frame, frame.labels, camera, rng)
+    labels = None if frame.labels is None else _labels(frame, camera, rng)
     return RGBDFrame(color, depth, labels, dataclasses.replace(frame.intrinsics, depth_scale=1000.0))
 
 
@@ -158,10 +158,8 @@ def _ellipses(shape: tuple[int, ...], camera: SimulatedCamera, rng: np.random.Ge
     return holes
 
 
-def _labels(
-    frame: RGBDFrame, labels: NDArray[np.integer], camera: SimulatedCamera, rng: np.random.Generator
-) -> NDArray[np.integer]:
-    changed = labels
+def _labels(frame: RGBDFrame, camera: SimulatedCamera, rng: np.random.Generator) -> NDArray[np.integer]:
+    changed = labels = frame.label_image
     size = 2 * abs(camera.mask) + 1
     if camera.mask > 0:
         changed = np.where(labels == 0, maximum_filter(labels, size), labels)
@@ -169,7 +167,7 @@ def _labels(
         inside = minimum_filter(labels, size) == maximum_filter(labels, size)
         changed = _cut(changed, ~inside)
     if camera.base:
-        changed = _cut(changed, _near_table(frame, labels, camera.base, rng))
+        changed = _cut(changed, _near_table(frame, camera.base, rng))
     return changed
 
 
@@ -180,12 +178,10 @@ def _cut(labels: NDArray[np.integer], pixels: NDArray[np.bool_]) -> NDArray[np.i
     return np.where(pixels & (share <= 1 - MIN_MASK)[labels], 0, labels).astype(labels.dtype)
 
 
-def _near_table(
-    frame: RGBDFrame, labels: NDArray[np.integer], height: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
+def _near_table(frame: RGBDFrame, height: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return the pixels [H, W] within `height` metres of the plane that fits most points around the masks."""
     points = backproject(frame.depth_m, frame.intrinsics)
-    seen = frame.depth_m > 0
+    labels, seen = frame.label_image, frame.depth_m > 0
     around = points[seen & (labels == 0) & (maximum_filter(labels, 2 * TABLE_MARGIN + 1) > 0)]
     if len(around) < 3:
         return np.zeros(labels.shape, bool)

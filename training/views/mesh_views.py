@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax import DESCRIPTOR_VERSION, DescriptorConfig, InputError
-from thor2_jax.frames.frames import pixel_points
 from thor2_jax.frames.outliers import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
 from training.augmentation.augmentations import KINDS, Augmentations, augment
@@ -70,8 +69,7 @@ def cloud_of(view: RenderedView) -> "Cloud":
     # Metres are float32 and the rest is float64, as in the released pipeline. Every fourth millimetre lies on a voxel
     # border, so the result depends on rounding.
     pixels = np.flatnonzero(view.depth)
-    depth = view.depth.take(pixels).astype(np.float32) / np.float32(1000)
-    points = pixel_points(pixels, depth, view.depth.shape[1], view.intrinsics)
+    points = view.frame.points(pixels).astype(np.float32)
     colors = view.color.reshape(-1, 3).take(pixels, axis=0).astype(np.float64)
     points, colors = downsample_to_fit(points.astype(np.float64) * SIGMA_S, colors, DESCRIPTOR_VOXEL)
     return (points / SIGMA_S).astype(np.float32), np.rint(colors).astype(np.uint8)
