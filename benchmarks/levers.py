@@ -26,18 +26,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cameras import (
-    ALL,
-    CAMERAS,
-    ORIGINAL,
-    RunResults,
-    add_camera_options,
-    answers_by_camera,
-    labelled_frames,
-    mean_and_deviation,
-    measure,
-    summarize,
-)
+from benchmarks import cameras
 from benchmarks.paper import markdown_table
 from benchmarks.timing import print_step
 from thor2_jax.errors import InputError
@@ -113,15 +102,15 @@ LEVERS = (
 default of `thor2 train` and of recognition."""
 
 COLUMNS = {
-    "real frames": (ORIGINAL, "accuracy"),
-    "simulated cameras": (ALL, "accuracy"),
-    "steady, real": (ORIGINAL, "steadiness"),
-    "steady, simulated": (ALL, "steadiness"),
-    "AUROC, real": (ORIGINAL, "auroc"),
-    "AUROC, simulated": (ALL, "auroc"),
-    "unknown named, real": (ORIGINAL, "unknown_named"),
-    "unknown named, simulated": (ALL, "unknown_named"),
-    "calibration error": (ORIGINAL, "calibration_error"),
+    "real frames": (cameras.ORIGINAL, "accuracy"),
+    "simulated cameras": (cameras.ALL, "accuracy"),
+    "steady, real": (cameras.ORIGINAL, "steadiness"),
+    "steady, simulated": (cameras.ALL, "steadiness"),
+    "AUROC, real": (cameras.ORIGINAL, "auroc"),
+    "AUROC, simulated": (cameras.ALL, "auroc"),
+    "unknown named, real": (cameras.ORIGINAL, "unknown_named"),
+    "unknown named, simulated": (cameras.ALL, "unknown_named"),
+    "calibration error": (cameras.ORIGINAL, "calibration_error"),
 }
 """Column of the table -> frames and metric."""
 
@@ -151,7 +140,7 @@ class Table:
         self.out: Path = options.out
         self.options = options
         self.meshes = find_meshes(options.meshes, options.names)
-        self.frames: list[LabelledFrame] = labelled_frames(options.frames, options.ignore)
+        self.frames: list[LabelledFrame] = cameras.labelled_frames(options.frames, options.ignore)
         job = {
             "meshes": {name: str(path.resolve()) for name, path in self.meshes.items()},
             "frames": [item.identifier for item in self.frames],
@@ -162,7 +151,7 @@ class Table:
         }
         begin_job(self.out, job)
 
-    def cell(self, lever: Lever, seed: int) -> RunResults | None:
+    def cell(self, lever: Lever, seed: int) -> cameras.RunResults | None:
         """Return the results of a lever with a seed; None if they are not computed yet."""
         file = self._cell_file(lever, seed)
         if not file.is_file():
@@ -216,13 +205,13 @@ class Table:
         runs = self._load(levers[0], directories)
 
         names = ", ".join(lever.name for lever in levers)
-        cameras = CAMERAS[self.options.cameras]
-        answers = answers_by_camera(runs, self.frames, cameras, lambda camera: print_step(f"{names}: {camera}"))
+        seen = cameras.CAMERAS[self.options.cameras]
+        answers = cameras.answers_by_camera(runs, self.frames, seen, lambda camera: print_step(f"{names}: {camera}"))
         for lever in levers:
-            for seed, results in zip(missing, measure(runs, answers, lever.fusion, lever.rule), strict=True):
+            for seed, results in zip(missing, cameras.measure(runs, answers, lever.fusion, lever.rule), strict=True):
                 self._write_cell(lever, seed, results)
 
-    def _write_cell(self, lever: Lever, seed: int, results: RunResults) -> None:
+    def _write_cell(self, lever: Lever, seed: int, results: cameras.RunResults) -> None:
         file = self._cell_file(lever, seed)
         file.parent.mkdir(parents=True, exist_ok=True)
         plain = {
@@ -238,9 +227,9 @@ class Table:
             cells = [results for seed in seeds if (results := self.cell(lever, seed)) is not None]
             if len(cells) < len(seeds):
                 continue
-            summary = report[lever.name] = summarize(cells)
+            summary = report[lever.name] = cameras.summarize(cells)
             values = [
-                mean_and_deviation(summary[part][metric]).replace("+-", "±") if part in summary else "-"
+                cameras.mean_and_deviation(summary[part][metric]).replace("+-", "±") if part in summary else "-"
                 for part, metric in COLUMNS.values()
             ]
             rows.append([lever.name, str(len(cells)), *values])
@@ -274,7 +263,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="OUT")
     parser.add_argument("--seeds", type=int, default=3, help="number of trainings (%(default)s)")
     parser.add_argument("--levers", nargs="+", metavar="NAME", help=f"of: {', '.join(lever.name for lever in LEVERS)}")
-    add_camera_options(parser)
+    cameras.add_camera_options(parser)
     parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='for all renderings ("%(default)s")')
     parser.add_argument("--train", default="", metavar="OPTIONS", help="for all trainings")
     parser.add_argument("--workers", type=int, default=2, help="rendering processes")

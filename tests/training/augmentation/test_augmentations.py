@@ -13,15 +13,8 @@ from scipy.special import ndtr
 
 from thor2_jax.files import json_digest
 from thor2_jax.frames.frames import backproject
-from training.augmentation.augmentations import (
-    KINDS,
-    Augmentations,
-    Base,
-    Occlusion,
-    Segmentation,
-    _silhouettes,
-    augment,
-)
+from training.augmentation import augmentations as module
+from training.augmentation.augmentations import KINDS, Augmentations, Base, Occlusion, Segmentation, augment
 from training.augmentation.sensing import Illumination, Registration
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import TRAINING_CAMERA, RayCaster, RenderedView, camera_pose
@@ -203,8 +196,8 @@ def test_edges_are_straight_or_outlines(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_silhouettes_are_those_of_the_built_in_objects() -> None:
-    bank = _silhouettes()
-    assert len(bank) == 4 * len(OBJECTS) and bank is _silhouettes()
+    bank = module._silhouettes()
+    assert len(bank) == 4 * len(OBJECTS) and bank is module._silhouettes()
     for silhouette in bank:
         assert silhouette.any() and not silhouette[[0, -1]].any() and not silhouette[:, [0, -1]].any()
     # Those of a ball are discs of its size, in pixels of 2 mm.

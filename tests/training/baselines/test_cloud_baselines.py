@@ -16,16 +16,6 @@ import thor2_jax as thor2
 from thor2_jax.networks.networks import model_arrays
 from training.baselines import cloud_baselines as module
 from training.baselines.baseline import BaselineInputs, Predictor
-from training.baselines.cloud_baselines import (
-    POINTS,
-    VIEW_TYPES,
-    PointNet,
-    camera_types,
-    forest_features,
-    load_pointnet,
-    load_thor,
-    view_types,
-)
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
@@ -37,7 +27,7 @@ def normal(sizes: tuple[int, ...]) -> thor2.PointClouds:
 
 def test_features_match_numpy() -> None:
     clouds = normal((400, 1, 0, 57))
-    features = forest_features(clouds, NETWORK, CLOSED)
+    features = module.forest_features(clouds, NETWORK, CLOSED)
     assert features.shape == (4, 22 + 3 + 14)
     aligned = np.asarray(thor2.turn(clouds, CLOSED).points, np.float64)
     points, mask = np.asarray(clouds.points, np.float64), np.asarray(clouds.mask)
@@ -73,11 +63,11 @@ def test_predictions_match_scikit_learn(depth: int | None, scale: int) -> None:
     )
 
 
-ARRAYS = model_arrays(PointNet(5, rngs=nnx.Rngs(3)))
+ARRAYS = model_arrays(module.PointNet(5, rngs=nnx.Rngs(3)))
 
 
 def pointnet(classes: int = 5) -> Predictor:
-    return load_pointnet(ARRAYS, SimpleNamespace(classes=("",) * classes))  # type: ignore[arg-type]
+    return module.load_pointnet(ARRAYS, SimpleNamespace(classes=("",) * classes))  # type: ignore[arg-type]
 
 
 def inputs(sizes: tuple[int, ...]) -> BaselineInputs:
@@ -86,10 +76,10 @@ def inputs(sizes: tuple[int, ...]) -> BaselineInputs:
 
 def test_probabilities_match_numpy() -> None:
     """The cloud has as many points as are sampled, so all of them are used."""
-    cloud = inputs((POINTS,))
+    cloud = inputs((module.POINTS,))
     arrays = {name: array.astype(np.float64) for name, array in ARRAYS.items()}
-    xyz = np.asarray(cloud.normal.points, np.float64)[0, :POINTS]
-    rgb = np.asarray(cloud.normal.colors, np.float64)[0, :POINTS]
+    xyz = np.asarray(cloud.normal.points, np.float64)[0, : module.POINTS]
+    rgb = np.asarray(cloud.normal.colors, np.float64)[0, : module.POINTS]
     x = np.concatenate([xyz - xyz.max(axis=0) / 2, rgb - 0.5], axis=1)
     for k in range(3):
         x = np.maximum(x @ arrays[f"shared/{k}/kernel"] + arrays[f"shared/{k}/bias"], 0)
@@ -103,7 +93,7 @@ def test_probabilities_match_numpy() -> None:
 
 
 def test_cloud_gives_the_same_alone_and_in_a_batch() -> None:
-    sizes = (POINTS - 1, POINTS + 1, 900, 1, 0)
+    sizes = (module.POINTS - 1, module.POINTS + 1, 900, 1, 0)
     both = inputs(sizes)
     probabilities = pointnet()(both)
     np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
@@ -124,7 +114,7 @@ def test_camera_types_match_the_published_lists() -> None:
     top = set(range(0, 55, 5)) | set(range(130, 185, 5))
     for azimuth, polar in itertools.product(range(0, 360, 5), range(0, 185, 5)):
         expected = (azimuth in front and polar in lying, azimuth in side and polar in lying, polar in top)
-        assert camera_types(azimuth, polar) == tuple(np.array(VIEW_TYPES)[list(expected)])
+        assert module.camera_types(azimuth, polar) == tuple(np.array(module.VIEW_TYPES)[list(expected)])
 
 
 def test_view_types_by_face_areas() -> None:
@@ -134,7 +124,7 @@ def test_view_types_by_face_areas() -> None:
         (("side", "top"), [(0.5, 0.5, 1), (0.5, 1, 0.5), (0.3, 0.7, 1)]),
         (("top",), [(0.79, 1, 1)]),
     ):
-        assert {view_types(*each) for each in areas} == {types}
+        assert {module.view_types(*each) for each in areas} == {types}
 
 
 def box(size: Sequence[float], camera: Sequence[float], edge: float | None = None) -> tuple[Any, Any, Any]:
@@ -158,12 +148,12 @@ def test_most_confident_selected_classifier_decides() -> None:
     clouds = [(xyz, np.zeros_like(xyz)) for xyz in points]
     normal = thor2.PointClouds.pack(clouds, camera=np.array(cameras), boundary=boundaries)
     inputs = BaselineInputs(normal, np.random.default_rng(0).random((6, 48)).astype(np.float32), None)
-    pairs = enumerate(itertools.product(VIEW_TYPES, (1, 2, 3)))
+    pairs = enumerate(itertools.product(module.VIEW_TYPES, (1, 2, 3)))
     models = {(name, k): random_classifier(16 * k, 4, seed) for seed, (name, k) in pairs}
     arrays = {path: a for (name, k), each in models.items() for path, a in model_arrays(each, f"{name}-{k}/").items()}
     selected = [("front side", 3), ("side top", 3), ("front side", 2), ("front side", 3), ("front", 3)]
     run = SimpleNamespace(config=CONFIG, classes=("",) * 4)
-    probabilities = load_thor(arrays, run)(inputs)
+    probabilities = module.load_thor(arrays, run)(inputs)
     assert probabilities.shape == (6, 4) and np.isfinite(probabilities).all()
     apply = nnx.jit(lambda model, tops: nnx.softmax(model(tops)))
     for row, (names, k) in enumerate(selected):
@@ -172,4 +162,4 @@ def test_most_confident_selected_classifier_decides() -> None:
         np.testing.assert_allclose(probabilities[row], max(rows, key=np.max), atol=1e-6)
     del arrays["side-2/head/bias"]
     with pytest.raises(ValueError, match="head/bias"):
-        load_thor(arrays, run)
+        module.load_thor(arrays, run)

@@ -14,18 +14,9 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
+from training.baselines import image_networks as networks
 from training.baselines.image_baselines import load_backbone, resampled_positions, tensors
-from training.baselines.image_networks import (
-    DENSENET_161,
-    GRU,
-    VIT_BASE,
-    VIT_DINOV2_SMALL,
-    VIT_TINY,
-    VIT_TINY_4,
-    DenseNet,
-    ResNet18,
-    ViT,
-)
+from training.baselines.image_networks import DENSENET_161, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, DenseNet, ViT
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 sys.path.append(str(GOLDEN))
@@ -51,13 +42,13 @@ def assert_golden(name: str, outputs: list[Any]) -> None:
 @pytest.mark.parametrize(
     ("name", "create", "size"),
     [
-        ("resnet18", ResNet18, 64),
+        ("resnet18", networks.ResNet18, 64),
         ("densenet_small", partial(DenseNet, 12, (2, 4, 4, 2)), 96),
         ("vit_tiny_4", partial(ViT, VIT_TINY_4, 96), 96),
         pytest.param("densenet_161", partial(DenseNet, **DENSENET_161), 64, marks=pytest.mark.slow),
         pytest.param("vit_tiny", partial(ViT, VIT_TINY, 224), 224, marks=pytest.mark.slow),
         pytest.param("vit_dinov2_small", partial(ViT, VIT_DINOV2_SMALL, 224), 224, marks=pytest.mark.slow),
-        pytest.param("vit_base", partial(ViT, VIT_BASE, 224), 224, marks=pytest.mark.slow),
+        pytest.param("vit_base", partial(ViT, networks.VIT_BASE, 224), 224, marks=pytest.mark.slow),
     ],
 )
 def test_backbones_match_timm(tmp_path: Path, name: str, create: Any, size: int) -> None:
@@ -72,7 +63,7 @@ def test_backbones_match_timm(tmp_path: Path, name: str, create: Any, size: int)
 
 
 def test_gru_matches_torch() -> None:
-    model = GRU(10, 7, rngs=nnx.Rngs(0))
+    model = networks.GRU(10, 7, rngs=nnx.Rngs(0))
     for layer, kind, inputs in ((model.input, "ih", 10), (model.hidden, "hh", 7)):
         layer.kernel[...] = jnp.asarray(random_tensor(f"weight_{kind}_l0", (21, inputs)).T)
         assert layer.bias is not None
