@@ -41,13 +41,13 @@ class LabelledInstances:
     Attributes:
         views: object -> its usable instances, at least one per object.
         skipped: for each unusable instance, the reason.
-        crops: object -> the crops of its usable instances, all of one size; None if no crops are needed.
+        crops: object -> the crops of its usable instances, all of one size; empty if no crops are needed.
         left_out: objects that `WithoutClasses` will omit.
     """
 
     views: Mapping[str, Sequence[PreparedInstance]]
     skipped: Sequence[str] = ()
-    crops: Mapping[str, Sequence[Crop]] | None = None
+    crops: Mapping[str, Sequence[Crop]] = dataclasses.field(default_factory=dict)
     left_out: Sequence[str] = ()
 
     @functools.cached_property
@@ -110,7 +110,7 @@ def read_instances(
             raise InputError("frames: no frame has a label; expected the names of the objects in labels.json")
         names = first_names(sorted(frames.names() or ())) or "the names in labels.json, which has none"
         raise InputError(f"frames: no label is {label_name!r}; expected one of {names}; see --label-name, --instance")
-    return LabelledInstances(views, [reason for _, reason in skipped], None if crop_size is None else crops)
+    return LabelledInstances(views, [reason for _, reason in skipped], crops)
 
 
 class WithLabelledViews:
@@ -193,7 +193,6 @@ class WithLabelledViews:
         """
         if index < len(self._rendered.shards):
             return self._rendered.read_crops(index, size)
-        assert self._instances.crops is not None
         name = self.classes[self.shards[index].label]
         crops, times = self._instances.crops[name], 1 + self._copies[name]
         reduced = ViewCrops.stacked(crops, len(crops[0][0])).reduced(size)
