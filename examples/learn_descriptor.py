@@ -38,7 +38,7 @@ from training.evaluation.answers import fusions
 from training.evaluation.job import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run
-from training.fitting.fit import scale_inputs
+from training.fitting.fit import FitState, scale_inputs
 from training.fitting.loop import FitOptions
 from training.fitting.samples import Batch, Samples, describe_batch, sample_views
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
@@ -95,23 +95,17 @@ class LearnedValues(NamedTuple):
         )
 
 
-class State(NamedTuple):
-    """The state of the training: weights and batch statistics of the classifiers, the descriptor, and Adam's state."""
-
-    weights: dict[str, Any]
-    rest: dict[str, Any]
-    free: LearnedValues
-    optimizer: Any
-
-
 def described(batch: Batch, free: LearnedValues) -> thor2.Descriptors:
     """Return the descriptors of a batch of samples."""
     return describe_batch(batch, NETWORK, CONFIG, free.parameters())
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
-def train_step(graphs: Any, state: State, batch: Batch, rates: tuple[Any, Any], key: jax.Array) -> State:
-    """Make one step of Adam on the sum of both losses; `rates` are those of the weights and of the descriptor."""
+def train_step(graphs: Any, state: FitState, batch: Batch, rates: tuple[Any, Any], key: jax.Array) -> FitState:
+    """Make one step of Adam on the sum of both losses.
+
+    The parameters are the weights of the classifiers and the learned values of the descriptor, with a rate for each.
+    """
 
     def loss_of(weights: dict[str, Any], free: LearnedValues) -> Any:
         descriptors, loss, rest = described(batch, free), jnp.zeros(()), {}
@@ -122,14 +116,13 @@ def train_step(graphs: Any, state: State, batch: Batch, rates: tuple[Any, Any], 
             rest[name] = nnx.state(model, nnx.Not(nnx.Param))
         return loss, rest
 
-    learned = state.weights, state.free
-    gradients, rest = jax.grad(loss_of, argnums=(0, 1), has_aux=True)(*learned)
+    gradients, rest = jax.grad(loss_of, argnums=(0, 1), has_aux=True)(*state.params)
     steps, optimizer = optax.adam(1.0).update(gradients, state.optimizer)
-    weights, free = (
+    params = tuple(
         jax.tree.map(lambda value, step: value + rate * step, values, part)  # noqa: B023
-        for values, part, rate in zip(learned, steps, rates, strict=True)
+        for values, part, rate in zip(state.params, steps, rates, strict=True)
     )
-    return State(weights, rest, free, optimizer)
+    return FitState(params, rest, optimizer)
 
 
 def train(samples: Samples, classes: tuple[str, ...], options: FitOptions, learn: bool) -> TrainedRun:
@@ -145,8 +138,8 @@ def train(samples: Samples, classes: tuple[str, ...], options: FitOptions, learn
         split: Any = nnx.split(model, nnx.Param, ...)
         graph, weights[name], rest[name] = split
         graphs.append((name, graph))
-    free = LearnedValues.start()
-    state = State(weights, rest, free, optax.adam(1.0).init((weights, free)))
+    learned = weights, LearnedValues.start()
+    state = FitState(learned, rest, optax.adam(1.0).init(learned))
 
     rng, key = np.random.default_rng(options.seed), jax.random.key(options.seed)
     batch_size = min(options.batch_size, len(samples))
@@ -160,7 +153,8 @@ def train(samples: Samples, classes: tuple[str, ...], options: FitOptions, learn
             step = epoch * n_steps + number
             state = train_step(tuple(graphs), state, batch, (rate, decay(step)), jax.random.fold_in(key, step))
 
-    parameters = state.free.parameters()
+    weights, free = state.params
+    parameters = free.parameters()
     # After conversion to float32, these are the values with which the classifiers were trained.
     config = dataclasses.replace(
         CONFIG,
@@ -168,7 +162,7 @@ def train(samples: Samples, classes: tuple[str, ...], options: FitOptions, learn
         persistence_weight=float(parameters.persistence_weight),
     )
     network = dataclasses.replace(NETWORK, similarity=np.asarray(parameters.similarity, np.float64))
-    classifiers = {name: nnx.merge(graph, state.weights[name], state.rest[name]) for name, graph in graphs}
+    classifiers = {name: nnx.merge(graph, weights[name], state.rest[name]) for name, graph in graphs}
     record = {"epochs": options.epochs, "seed": options.seed, "learned": learn}
     return TrainedRun(config, network, classes, classifiers, record)
 
