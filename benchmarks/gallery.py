@@ -11,14 +11,13 @@ import json
 import resource
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.timing import time_calls
+from benchmarks.timing import seconds_of, time_calls
 from thor2_jax.frames.prepared_instance import instance_view
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import ObjectGallery
@@ -108,9 +107,9 @@ def measure_enrollment(options: argparse.Namespace) -> dict[str, Any]:
         report = {}
         for attempt in range(options.repeats + 1):  # the first repeat compiles
             before = [str(answer) for answer in recognizer.recognize(scenes[0].frame)]
-            report["mesh"] = _seconds(lambda: _enroll_mesh(recognizer.objects, meshes[name]))
-            report["forget"] = _seconds(lambda: recognizer.forget("new"))
-            report[f"{len(frames)} views"] = _seconds(lambda: recognizer.enroll("new", frames))
+            report["mesh"] = seconds_of(lambda: _enroll_mesh(recognizer.objects, meshes[name]))
+            report["forget"] = seconds_of(lambda: recognizer.forget("new"))
+            report[f"{len(frames)} views"] = seconds_of(lambda: recognizer.enroll("new", frames))
             recognizer.forget("new")
             report["answers restored"] = before == [str(answer) for answer in recognizer.recognize(scenes[0].frame)]
             print("compiling:" if attempt == 0 else "warm:", json.dumps(report), flush=True)
@@ -119,12 +118,6 @@ def measure_enrollment(options: argparse.Namespace) -> dict[str, Any]:
 
 def _enroll_mesh(objects: ObjectGallery, mesh: Any) -> None:
     objects.enroll("new", mesh_views(mesh), "mesh", surfaces_of([mesh]).arrays)
-
-
-def _seconds(function: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
 
 
 def main() -> None:

@@ -42,7 +42,6 @@ class Peer:
         axes = box.R.T[np.argsort(-box.extent)]
         axes[2] = np.cross(axes[0], axes[1])
         turned = points @ axes.T
-        camera = np.zeros(3)
         for i, j in ((0, 1), (1, 2)):
             rectangle = cv2.minAreaRect(turned[:, [i, j]].astype(np.float32))
             angle = math.radians(rectangle[2])
@@ -50,10 +49,8 @@ class Peer:
             c, s = math.cos(angle), math.sin(angle)
             u, v = turned[:, i].copy(), turned[:, j].copy()
             turned[:, i], turned[:, j] = c * u + s * v, c * v - s * u
-            u, v = camera[i], camera[j]
-            camera[i], camera[j] = c * u + s * v, c * v - s * u
         middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
-        if camera[2] > middle[2]:
+        if middle[2] < 0:  # the camera stays at the origin
             turned[:, 1:] *= -1
         if turned[:, 0].mean() > middle[0]:
             turned[:, :2] *= -1

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-__all__ = ["Timing", "print_step", "time_calls"]
+__all__ = ["Timing", "print_step", "seconds_of", "time_calls"]
 
 
 class Timing(NamedTuple):
@@ -17,18 +17,19 @@ class Timing(NamedTuple):
     median: float
 
 
+def seconds_of(function: Callable[[], Any]) -> float:
+    """Call `function`, wait for its result, and return the elapsed seconds."""
+    start = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - start
+
+
 def time_calls(function: Callable[[], Any], seconds: float = 2.0, least: int = 5) -> Timing:
     """Call `function` at least `least` times and for at least `seconds`, waiting for each result."""
-
-    def once() -> float:
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        return time.perf_counter() - start
-
-    first = once()
+    first = seconds_of(function)
     calls: list[float] = []
     while len(calls) < least or sum(calls) < seconds:
-        calls.append(once())
+        calls.append(seconds_of(function))
     return Timing(first, statistics.median(calls))
 
 
