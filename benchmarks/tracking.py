@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cameras import labelled_frames
+from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.frames.frames import Intrinsics
@@ -217,7 +218,7 @@ def main() -> None:
         seeds = range(options.scenes) if options.meshes else ()
         missing = [seed for seed in seeds if str(seed) not in stored["scenes"]]
         if missing:
-            recognizer = Recognizer.load(options.model[0])
+            recognizer = Recognizer.load(options.model[0], chunk=BATCH_BUCKETS[-1])
             paths, classes = find_meshes(options.meshes, options.names), recognizer.run.classes
             meshes = {name: load_mesh(path) for name, path in paths.items() if name in classes}
             table = view_table(recognizer, meshes)
