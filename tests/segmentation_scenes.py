@@ -92,7 +92,7 @@ def render(
     is_hit = hits.mesh >= 0
     rng = np.random.default_rng(0)
     colors = np.where(is_hit[:, None], hits.color, TABLE) + rng.normal(0, 2, hits.color.shape)
-    inverse = 1 / hits.distance.astype(float) + rng.normal(0, noise, is_hit.shape)
+    inverse = 1 / np.where(is_hit, hits.distance, np.inf).astype(float) + rng.normal(0, noise, is_hit.shape)
     metres = np.where(is_hit & (inverse > 0), 1 / inverse, 0)
     return RGBDFrame(
         np.clip(colors, 0, 255).astype(np.uint8).reshape(*size, 3),

@@ -208,7 +208,7 @@ class Hits:
     """First intersections of rays with surfaces.
 
     Attributes:
-        distance: [n] float32, in units of the direction's length; inf without a hit.
+        distance: [n] float32, in units of the direction's length; 0 without a hit.
         mesh: [n] int32, index of the hit mesh; -1 without a hit.
         color: [n, 3] uint8; 0 without a hit.
     """
@@ -245,18 +245,14 @@ class RayCaster:
             directions: [n, 3], of any length.
         """
         directions = np.ascontiguousarray(directions, np.float32)
-        origins = np.full_like(directions, origin)
-        result = self._scene.run(origins, directions, output=True)
-        is_hit = result["primID"] >= 0
-        distance = np.where(is_hit, result["tfar"], np.float32(np.inf))
-        mesh_index = np.where(is_hit, result["geomID"].astype(np.int32), np.int32(-1))
+        result = self._scene.run(np.full_like(directions, origin), directions, output=True)
         color = np.zeros((len(directions), 3), np.uint8)
         for index, mesh in enumerate(self.meshes):
-            here = np.flatnonzero(mesh_index == index)
-            if len(here):
-                barycentric = np.stack([result["u"].take(here), result["v"].take(here)]).T
-                color[here] = mesh.colors_at(result["primID"].take(here), barycentric)
-        return Hits(distance, mesh_index, color)
+            here = np.flatnonzero(result["geomID"] == index)
+            barycentric = np.stack([result["u"].take(here), result["v"].take(here)]).T
+            color[here] = mesh.colors_at(result["primID"].take(here), barycentric)
+        distance = np.where(result["geomID"] >= 0, result["tfar"], np.float32(0))
+        return Hits(distance, result["geomID"], color)
 
     def render(self, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> RenderedView:
         """Render colours and depth from a pose.
@@ -273,8 +269,7 @@ class RayCaster:
         intrinsics = Intrinsics(k.fx, k.fy, k.cx - left, k.cy - top)
         height, width = bottom - top, right - left
         hits = self.cast(pose[:3, 3], pixel_rays(intrinsics, height, width, pose))
-        distance = np.where(hits.mesh >= 0, hits.distance, 0)
-        depth = np.rint(distance.astype(np.float64) * 1000).astype(np.uint16).reshape(height, width)
+        depth = np.rint(hits.distance.astype(np.float64) * 1000).astype(np.uint16).reshape(height, width)
         return RenderedView(hits.color.reshape(height, width, 3), depth, intrinsics, pose, (top, left))
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from thor2_jax import InputError, Intrinsics, RGBDFrame
 from training.objects.mesh import QUAD_FACES, QUAD_UV, TexturedMesh
@@ -81,12 +82,7 @@ class _Placed:
         return bool(max(gaps.max(), other_gaps.max()) >= MIN_GAP)
 
 
-SIDES: Array = np.array([
-    [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
-    [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
-], np.float64)  # fmt: skip
+SIDES = Rotation.from_rotvec([[90, 0, 0], [-90, 0, 0], [0, -90, 0], [0, 90, 0]], degrees=True).as_matrix().round()
 """Rotations [4, 3, 3] that turn each of the four sides down."""
 
 
@@ -299,7 +295,7 @@ def _render(
         truth[label] = name
         visible[label] = pixels / int((RayCaster([mesh]).render(pose, camera).depth > 0).sum())
 
-    depth = np.where(hits.mesh >= 0, hits.distance, 0).astype(np.float64).reshape(shape)
+    depth = hits.distance.astype(np.float64).reshape(shape)
     color = np.where(hits.mesh[:, None] >= 0, hits.color, np.array([92, 96, 104])).reshape(*shape, 3)
     gain = rng.uniform(1 - light, 1 + light) * rng.uniform(1 - light / 4, 1 + light / 4, 3)
     lit = color * gain + noise * 2 * rng.standard_normal(color.shape, np.float32)
