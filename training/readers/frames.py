@@ -8,6 +8,7 @@ import collections
 import dataclasses
 import functools
 import itertools
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -278,13 +279,12 @@ class _Recording:
     """Reader of frames by number; it starts again from the beginning if a number is lower than the previous one."""
 
     def __init__(self, open_bag: Callable[[], Bag], every: int) -> None:
-        self._open, self._every = open_bag, every
-        self._numbered: Iterator[tuple[int, RecordedFrame]] = iter(())
-        self._last: tuple[int, RecordedFrame] | None = None
+        self._open, self._every, self._number = open_bag, every, math.inf
 
     def read(self, number: int) -> RGBDFrame:
-        if self._last is None or self._last[0] > number:
-            self._last, self._numbered = None, enumerate(_frames(self._open(), self._every))
-        while self._last is None or self._last[0] < number:
-            self._last = next(self._numbered)
-        return self._last[1].read()
+        if self._number > number:
+            self._numbered = enumerate(_frames(self._open(), self._every))
+            self._number, self._frame = next(self._numbered)
+        while self._number < number:
+            self._number, self._frame = next(self._numbered)
+        return self._frame.read()

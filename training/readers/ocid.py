@@ -59,10 +59,10 @@ class OCID(LabelledFrames):
         """
         path = self.dataset_folder(path)
         root = path / "YCB10" if (path / "YCB10").is_dir() else path
-        images: list[tuple[str, Path]] = []  # <place>/<camera>/<type>/<sequence>, image
+        images: dict[str, Path] = {}  # <place>/<camera>/<type>/<sequence>/<image> -> file
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):
-            paths = sorted((root / place / camera).glob("*/*/rgb/*.png"))
-            images += [(image.parents[1].relative_to(root).as_posix(), image) for image in paths]
+            files = sorted((root / place / camera).glob("*/*/rgb/*.png"))
+            images |= {f"{file.parents[1].relative_to(root).as_posix()}/{file.stem}": file for file in files}
         if not images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
         names = as_path(names, "names")
@@ -70,17 +70,12 @@ class OCID(LabelledFrames):
         self._is_complete = not isinstance(value, list)
         if isinstance(value, list):
             self._names, listed = _names_of_vlg(names, value)
-            images = [
-                (sequence, image)
-                for sequence, image in images
-                if any(image.stem in listed.get(end, ()) for end in path_ends(sequence))
-            ]
+            images = {image: file for image, file in images.items() if not listed.isdisjoint(path_ends(image))}
             if not images:
                 raise InputError(f"{names} lists no frame of {path}; expected image_filename <sequence>,<image>")
         else:
-            self._names = _names_in_order(names, value, dict.fromkeys(sequence for sequence, _ in images))
-        self.identifiers = [f"{sequence}/{image.stem}" for sequence, image in images]
-        self.sources = [image for _, image in images]
+            self._names = _names_in_order(names, value, dict.fromkeys(map(sequence_of, images)))
+        self.identifiers, self.sources = list(images), list(images.values())
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
         """Read a frame, its names, and the place, the camera and the type of its sequence.
@@ -137,13 +132,13 @@ def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[st
     return named
 
 
-def _names_of_vlg(path: Path, items: Sequence[Any]) -> tuple[dict[str, dict[int, str]], dict[str, set[str]]]:
-    """Return sequence -> label -> name and sequence -> stems of its images from a table of OCID-VLG.
+def _names_of_vlg(path: Path, items: Sequence[Any]) -> tuple[dict[str, dict[int, str]], set[str]]:
+    """Return sequence -> label -> name, and the images <sequence>/<stem>, from a table of OCID-VLG.
 
     All images of a sequence share the names, since labels number its objects in the order of placement.
     """
     names: dict[str, dict[int, str]] = {}
-    images: dict[str, set[str]] = {}
+    images: set[str] = set()
     for position, item in enumerate(items):
         try:
             file, answer, target = item["image_filename"], item["answer"], item["target"]
@@ -162,7 +157,7 @@ def _names_of_vlg(path: Path, items: Sequence[Any]) -> tuple[dict[str, dict[int,
             raise InputError(
                 f"{path}: label {label} of {sequence} has the names {known!r} and {target!r}; expected one"
             )
-        images.setdefault(sequence, set()).add(Path(image.strip()).stem)
+        images.add(f"{sequence}/{Path(image.strip()).stem}")
     return names, images
 
 
