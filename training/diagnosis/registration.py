@@ -108,14 +108,19 @@ def label_edges(labels: NDArray[Any]) -> Field:
     return is_edge * _double_angle(_gradient(is_object, 1.5))
 
 
-def _spectrum(fixed: Field) -> Field:
-    """Return the Fourier transform of edges [H, W] with a margin of `MAX_SHIFT`, padded to an efficient size."""
-    shape = [fft.next_fast_len(n + 2 * MAX_SHIFT) for n in fixed.shape]
-    return fft.fft2(np.pad(fixed, MAX_SHIFT).astype(np.complex64), shape)
+def _reduced(color: NDArray[np.uint8], other: NDArray[Any]) -> tuple[int, Field, NDArray[Any]]:
+    """Return n, the spectrum of the colour edges, and the other image; both of every n-th pixel, about `WIDTH` columns.
+
+    The spectrum is the Fourier transform with a margin of `MAX_SHIFT`, padded to an efficient size.
+    """
+    step = max(round(color.shape[1] / WIDTH), 1)
+    edges = np.pad(color_edges(color[::step, ::step]), MAX_SHIFT)
+    spectrum = fft.fft2(edges.astype(np.complex64), [fft.next_fast_len(n) for n in edges.shape])
+    return step, spectrum, other[::step, ::step]
 
 
 def _align(moved: Field, spectrum: Field) -> Alignment:
-    """Return the best shift of the edges `moved` [H, W] onto the edges with this `_spectrum`."""
+    """Return the best shift of the edges `moved` [H, W] onto the edges with this spectrum, see `_reduced`."""
     n_edges, reach = int(np.count_nonzero(moved)), MAX_SHIFT
     product = spectrum * np.conj(fft.fft2(moved.astype(np.complex64), spectrum.shape))
     correlation = fft.ifft2(product)[: 2 * reach + 1, : 2 * reach + 1].real / max(n_edges, 1)
@@ -128,12 +133,6 @@ def _align(moved: Field, spectrum: Field) -> Alignment:
     return Alignment(right, down, peak, near, peak / spread, near / spread, n_edges)
 
 
-def _reduced(color: NDArray[np.uint8], other: NDArray[Any]) -> tuple[int, NDArray[np.uint8], NDArray[Any]]:
-    """Return n and every n-th pixel of both images, which reduces them to about `WIDTH` columns."""
-    step = max(round(color.shape[1] / WIDTH), 1)
-    return step, color[::step, ::step], other[::step, ::step]
-
-
 def _zoomed(image: NDArray[Any], factor: float) -> NDArray[Any]:
     """Return an image enlarged about its centre, in an array of the same size; 0 outside."""
     height, width = image.shape
@@ -144,8 +143,7 @@ def _zoomed(image: NDArray[Any], factor: float) -> NDArray[Any]:
 
 def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: NDArray[np.floating[Any]]) -> None:
     """Check whether depth [H, W] is registered to colour [H, W, 3]."""
-    step, color, depth_m = _reduced(color, depth_m)
-    spectrum = _spectrum(color_edges(color))
+    step, spectrum, depth_m = _reduced(color, depth_m)
     plain = _align(depth_edges(depth_m), spectrum)
     if plain.n_edges < MIN_EDGES:
         diagnosis.notes.append("registration of colour and depth: not checked, since depth has too few edges")
@@ -181,8 +179,8 @@ def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: 
 
 def check_labels_alignment(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[Any]) -> None:
     """Check whether the borders of the instances [H, W] lie on edges of colour [H, W, 3]."""
-    step, color, labels = _reduced(color, labels)
-    alignment = _align(label_edges(labels), _spectrum(color_edges(color)))
+    step, spectrum, labels = _reduced(color, labels)
+    alignment = _align(label_edges(labels), spectrum)
     if alignment.n_edges < MIN_EDGES or alignment.height < MIN_PEAK:
         return
     if alignment.distance > MAX_REGISTERED and alignment.peak >= MIN_GAIN * alignment.near:

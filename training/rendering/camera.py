@@ -11,7 +11,7 @@ below (paper, section "Training"). No light is added, since the textures of scan
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -194,17 +194,15 @@ def _pixel_box(vertices: NDArray[np.float64], pose: NDArray[np.float64], camera:
     in_camera = (vertices - pose[:3, 3]) @ pose[:3, :3]
     if in_camera[:, 2].min() <= 0:
         return 0, camera.height, 0, camera.width
-    k = camera.intrinsics
-    box = []
-    for axis, (f, c, size) in enumerate([(k.fx, k.cx, camera.width), (k.fy, k.cy, camera.height)]):
-        pixels = in_camera[:, axis] / in_camera[:, 2] * f + c
-        low = int(np.clip(np.floor(pixels.min()), 0, size - 1))
-        box.append((low, int(np.clip(np.ceil(pixels.max()) + 1, low + 1, size))))
-    return *box[1], *box[0]
+    k, size = camera.intrinsics, np.array([camera.width, camera.height])
+    pixels = in_camera[:, :2] / in_camera[:, 2:] * [k.fx, k.fy] + [k.cx, k.cy]
+    low = np.clip(np.floor(pixels.min(axis=0)), 0, size - 1).astype(int)
+    high = np.clip(np.ceil(pixels.max(axis=0)) + 1, low + 1, size).astype(int)
+    (left, top), (right, bottom) = low.tolist(), high.tolist()
+    return top, bottom, left, right
 
 
-@dataclasses.dataclass(frozen=True)
-class Hits:
+class Hits(NamedTuple):
     """First intersections of rays with surfaces.
 
     Attributes:

@@ -9,7 +9,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -155,26 +155,23 @@ def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mappin
     Raises:
         InputError: the records differ; the message names the first different field and both values.
     """
-    if difference := _first_difference("", stored, json.loads(json.dumps(requested))):
-        field, old, new = difference
+    for field, old, new in _differences("", stored, json.loads(json.dumps(requested))):
         raise InputError(
             f"out: {directory} was written with {field} {_shown(old)}, not {_shown(new)}; "
             "repeat the command with the same options and unchanged files, or choose another directory"
         )
 
 
-def _first_difference(field: str, stored: Any, requested: Any) -> tuple[str, Any, Any] | None:
-    """Return the path of the first different field and both values; a missing value is None."""
-    inner: list[tuple[str, Any, Any]] = []
+def _differences(field: str, stored: Any, requested: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the path of each different field and both values; a missing value is None."""
     if isinstance(stored, Mapping) and isinstance(requested, Mapping):
-        keys = dict.fromkeys([*requested, *stored])
-        inner = [(f"{field}.{key}" if field else key, stored.get(key), requested.get(key)) for key in keys]
+        for key in dict.fromkeys([*requested, *stored]):
+            yield from _differences(f"{field}.{key}" if field else key, stored.get(key), requested.get(key))
     elif isinstance(stored, list) and isinstance(requested, list):
-        pairs = itertools.zip_longest(stored, requested)
-        inner = [(f"{field}[{index}]", *pair) for index, pair in enumerate(pairs)]
+        for index, pair in enumerate(itertools.zip_longest(stored, requested)):
+            yield from _differences(f"{field}[{index}]", *pair)
     elif stored != requested:
-        return field, stored, requested
-    return next((difference for entry in inner if (difference := _first_difference(*entry))), None)
+        yield field, stored, requested
 
 
 def _shown(value: Any) -> str:
