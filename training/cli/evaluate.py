@@ -20,7 +20,6 @@ evaluate_app = typer.Typer(
 app.add_typer(evaluate_app, name="evaluate")
 
 DatasetArgument = Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of the dataset.")]
-MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="RUN", help="Further run directories.")]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,19 +31,20 @@ class EvaluationOptions(options.WorkerOptions):
         Path | None, typer.Option(help="Directory for report.html and report.json; an interrupted evaluation resumes.")
     ] = None
     quiet: options.QuietOption = False
+    runs: Annotated[list[Path] | None, typer.Argument(metavar="RUN", help="Further run directories.")] = None
 
 
 @evaluate_app.command()
 @options.grouped_options
-def uwis(dataset: DatasetArgument, job: EvaluationOptions, runs: MoreModels = None) -> None:
+def uwis(dataset: DatasetArgument, job: EvaluationOptions) -> None:
     """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
     from training.readers.uwis import UWISOccluded
 
-    _evaluate("uwis", UWISOccluded(dataset), dataset, job, runs)
+    _evaluate("uwis", UWISOccluded(dataset), dataset, job)
 
 
 @evaluate_app.command()
-@functools.partial(options.grouped_options, without=options.RECORDING_OPTIONS)
+@functools.partial(options.grouped_options, without=(*options.RECORDING_OPTIONS, "runs"))
 def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     """Frames with named objects: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
 
@@ -63,7 +63,7 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     dataset = ", ".join(str(path.resolve()) for path in given.frames or files)
     if folder.note:
         console.print(f"skipped: {folder.note}")
-    _evaluate("frames", folder, dataset, job, runs, given=given)
+    _evaluate("frames", folder, dataset, dataclasses.replace(job, runs=runs), given=given)
 
 
 @evaluate_app.command()
@@ -74,7 +74,6 @@ def ocid(
     names: Annotated[
         Path, typer.Option(help="Table: sequence -> object names in order of placement; or a table of OCID-VLG.")
     ],
-    runs: MoreModels = None,
     per_sequence: Annotated[
         bool, typer.Option("--per-sequence", help="RUN holds one run per sequence (`train --sequences`).")
     ] = False,
@@ -82,7 +81,7 @@ def ocid(
     """OCID, subset YCB10: {table,floor}/{bottom,top}/<type>/<sequence>/{rgb,depth,label,pcd}."""
     from training.readers.ocid import OCID
 
-    _evaluate("ocid", OCID(dataset, names), dataset, job, runs, per_sequence, names)
+    _evaluate("ocid", OCID(dataset, names), dataset, job, per_sequence, names)
 
 
 @evaluate_app.command()
@@ -91,12 +90,11 @@ def bop(
     dataset: DatasetArgument,
     job: EvaluationOptions,
     names: Annotated[Path | None, typer.Option(help="YAML or JSON table: obj_id -> name. Default: obj_000001.")] = None,
-    runs: MoreModels = None,
 ) -> None:
     """BOP format (YCB-Video and others): <scene>/{rgb,depth,mask_visib}, scene_camera.json and scene_gt.json."""
     from training.readers.bop import BOP
 
-    _evaluate("bop", BOP(dataset, names), dataset, job, runs, names=names)
+    _evaluate("bop", BOP(dataset, names), dataset, job, names=names)
 
 
 def _evaluate(
@@ -104,7 +102,6 @@ def _evaluate(
     frames: Any,
     dataset: Path | str,
     job: EvaluationOptions,
-    runs: list[Path] | None,
     per_sequence: bool = False,
     names: Path | None = None,
     given: options.FrameOptions | None = None,
@@ -113,7 +110,7 @@ def _evaluate(
     from thor2_jax.model.run_record import RUN_FILE
     from training.evaluation.job import answer_frames_in_pool, evaluate_dataset, load_runs
 
-    models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
+    models, out, pool = (*job.model, *(job.runs or ())), job.out, job.pool()
     load = models, tuple(frames.identifiers) if per_sequence else None
     description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
