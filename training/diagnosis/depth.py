@@ -57,11 +57,10 @@ def instance_extents(frame: RGBDFrame) -> dict[int, float]:
         depth = depths[pixels]
         median = np.median(depth[depth > 0]) if (depth > 0).any() else 0
         chosen = (depth > 0) & (np.abs(depth - median) < 0.25 * median)
-        if chosen.sum() < MIN_PIXELS:
-            continue
-        points = frame.points(pixels[chosen])
-        axes = np.linalg.eigh(np.cov(points.T))[1]
-        extents[label] = float(np.ptp(np.percentile(points @ axes, (2, 98), axis=0), axis=0).max())
+        if chosen.sum() >= MIN_PIXELS:
+            points = frame.points(pixels[chosen])
+            axes = np.linalg.eigh(np.cov(points.T))[1]
+            extents[label] = float(np.ptp(np.percentile(points @ axes, (2, 98), axis=0), axis=0).max())
     return extents
 
 

@@ -133,12 +133,10 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
                     total += member.size
                     if total > MAX_BYTES:
                         raise InputError(f"more than {MAX_BYTES:,} bytes")
-                    if not member.isfile() or path.parent.name != "google_16k" or path.name.startswith("."):
-                        continue
-                    source = content.extractfile(member)
-                    assert source is not None  # not None for a regular file
-                    with source, (folder / path.name).open("xb") as target:
-                        shutil.copyfileobj(source, target)
+                    is_of_mesh = path.parent.name == "google_16k" and not path.name.startswith(".")
+                    if is_of_mesh and member.isfile() and (source := content.extractfile(member)):
+                        with source, (folder / path.name).open("xb") as target:
+                            shutil.copyfileobj(source, target)
                 while stream.read(CHUNK_BYTES):
                     pass
             load_mesh(folder / MESH_FILE)

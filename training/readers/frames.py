@@ -13,6 +13,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import parse_json, read_file
@@ -105,14 +106,11 @@ def frame_files(folder: Path) -> FrameFiles:
 
     A missing file gets the first of its possible names; a missing label image is None.
     """
-
-    def existing(kind: str) -> Path | None:
-        return next((folder / name for name in FILE_NAMES[kind] if (folder / name).is_file()), None)
-
-    color, depth, intrinsics = (
-        existing(kind) or folder / FILE_NAMES[kind][0] for kind in ("color", "depth", "intrinsics")
-    )
-    return FrameFiles(color, depth, existing("labels"), intrinsics)
+    files: dict[str, Any] = {}
+    for kind, names in FILE_NAMES.items():
+        default = None if kind == "labels" else folder / names[0]
+        files[kind] = next((folder / name for name in names if (folder / name).is_file()), default)
+    return FrameFiles(**files)
 
 
 def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list[FrameSource]:
