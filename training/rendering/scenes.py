@@ -143,19 +143,6 @@ def _anywhere(rng: np.random.Generator) -> Iterator[Array]:
         reach *= 1.005
 
 
-def _arrange(
-    meshes: Sequence[TexturedMesh], towards: Array, clutter: float, rng: np.random.Generator
-) -> list[TexturedMesh]:
-    placed: list[_Placed] = []
-    for mesh in meshes:
-        new = _put_down(mesh, rng)
-        in_line = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else ()
-        places = itertools.chain(in_line, _anywhere(rng))
-        place = next(each for each in places if all(new.apart(other, each) for other in placed))
-        placed.append(_Placed(new.mesh.moved((*place, 0)), new.corners + place, new.normals))
-    return [item.mesh for item in placed]
-
-
 def _table() -> TexturedMesh:
     """Return a table: a square of 1.6 m at z = 0 with planks in slightly different greyish browns."""
     planks = np.random.default_rng(0).integers(-9, 10, (16, 1, 1))
@@ -268,8 +255,14 @@ def _composed(
     azimuth = rng.uniform(0, 2 * np.pi)
     pose = _random_pose(rng, azimuth)
     towards = np.array([np.cos(azimuth), np.sin(azimuth)])
-    arranged = _arrange([objects[name] for name in names], towards, clutter, rng)
-    return dict(zip(names, arranged, strict=True)), azimuth, pose
+    placed: list[_Placed] = []
+    for name in names:
+        new = _put_down(objects[name], rng)
+        in_line = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else ()
+        places = itertools.chain(in_line, _anywhere(rng))
+        place = next(each for each in places if all(new.apart(other, each) for other in placed))
+        placed.append(_Placed(new.mesh.moved((*place, 0)), new.corners + place, new.normals))
+    return dict(zip(names, (each.mesh for each in placed), strict=True)), azimuth, pose
 
 
 def _random_pose(rng: np.random.Generator, azimuth: float) -> Array:

@@ -77,8 +77,8 @@ def test_clutter_increases_occlusion() -> None:
 
 def test_objects_stand_apart_on_the_table() -> None:
     for seed in range(4):
-        rng = np.random.default_rng(seed)
-        meshes = module._arrange(list(OBJECTS.values())[seed::4], np.array([1.0, 0]), 0.8, rng)
+        objects = dict(list(OBJECTS.items())[seed::4])
+        meshes = list(module._composed(objects, len(objects), 0.8, np.random.default_rng(seed))[0].values())
         for k, one in enumerate(meshes):
             assert one.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
             for other in meshes[k + 1 :]:
