@@ -1,11 +1,10 @@
 """`thor2 train`: train a recognizer."""
 
 import atexit
-import contextlib
 import dataclasses
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -195,26 +194,18 @@ def train(
         leave_out=options.split_names(leave_out),
         **vars(given),
     )
-    with _together(processes), show_progress(quiet) as progress:
-        trained = run_train_job(job, progress)
-    for directory, runs in trained.items():
-        _report(directory, runs, has_baselines=bool(job.baselines))
-
-
-@contextlib.contextmanager
-def _together(processes: int) -> Iterator[None]:
-    """Train with other processes in the context; after an error, this process ends without waiting for the others.
-
-    JAX would wait for them at exit, while they wait for the next step of this process.
-    """
     try:
-        yield
+        with show_progress(quiet) as progress:
+            trained = run_train_job(job, progress)
     except BaseException as error:
+        # JAX would wait for the other processes at exit, while they wait for the next step of this process.
         if processes > 1:
             atexit.register(os._exit, 130 if isinstance(error, KeyboardInterrupt) else 2)
         if "Gloo" in str(error):  # JAX's communication between processors
             raise InputError("coordinator: another process has ended; start all of them again to resume") from error
         raise
+    for directory, runs in trained.items():
+        _report(directory, runs, has_baselines=bool(job.baselines))
 
 
 def _report(directory: Path, runs: Sequence[Any], has_baselines: bool) -> None:

@@ -45,7 +45,13 @@ def write_sample_frames(directory: str | Path) -> None:
     for name, title, seed, n_objects in SAMPLES:
         rng = np.random.default_rng(seed)
         scene = compose_scene(objects, rng, n_objects=n_objects, noise=NOISE, light=0.2)
-        _write(_crop(scene.frame), directory / name)
+        frame, folder = _crop(scene.frame), directory / name
+        folder.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(frame.color).save(folder / "color.jpg", quality=85, subsampling=0)
+        Image.fromarray(frame.depth).save(folder / "depth.png", optimize=True)
+        Image.fromarray(frame.label_image).save(folder / "labels.png", optimize=True)
+        known = {name: value for name, value in dataclasses.asdict(frame.intrinsics).items() if value}
+        (folder / "intrinsics.json").write_text(json.dumps(known) + "\n")
         index.append({"folder": name, "title": title, "objects": sorted(set(scene.truth.values()))})
     (directory / "index.json").write_text(json.dumps(index, indent=1) + "\n")
 
@@ -61,12 +67,3 @@ def _crop(frame: RGBDFrame) -> RGBDFrame:
     camera = dataclasses.replace(frame.intrinsics, cx=frame.intrinsics.cx - left, cy=frame.intrinsics.cy - top)
     window = slice(top, top + down), slice(left, left + across)
     return RGBDFrame(frame.color[window], frame.depth[window], frame.label_image[window], camera)
-
-
-def _write(frame: RGBDFrame, directory: Path) -> None:
-    directory.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(frame.color).save(directory / "color.jpg", quality=85, subsampling=0)
-    Image.fromarray(frame.depth).save(directory / "depth.png", optimize=True)
-    Image.fromarray(frame.label_image).save(directory / "labels.png", optimize=True)
-    known = {name: value for name, value in dataclasses.asdict(frame.intrinsics).items() if value}
-    (directory / "intrinsics.json").write_text(json.dumps(known) + "\n")
