@@ -13,7 +13,7 @@ from scipy import ndimage
 from thor2_jax import InputError, Intrinsics
 from training.objects.meshes import MAX_SIDE, MIN_SIDE, read_mesh
 
-__all__ = ["Diagnosis", "check_camera", "check_labels", "check_meshes"]
+__all__ = ["Diagnosis", "Finding", "check_camera", "check_labels", "check_meshes"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame
-from training.diagnosis.checks import Diagnosis
+from training.diagnosis.checks import Diagnosis, Finding
 
 __all__ = ["check_depth", "instance_extents"]
 
@@ -102,9 +102,9 @@ def check_depth(
         mesh_sides = {}  # of other objects
         diagnosis.notes.append("meshes: of no object in labels.json, so the sizes of the objects were not compared")
     compared, sides = [extents[label] for label in own or extents], [*(own or mesh_sides).values()]
-    if MIN_DEPTH <= median <= MAX_DEPTH and _check_focal_length(diagnosis, median, compared, sides, bool(own)):
-        return
-    if _check_unit(diagnosis, frame, median, compared, sides):
+    finding = _wrong_focal_length(median, compared, sides, bool(own)) or _wrong_unit(frame, median, compared, sides)
+    if finding is not None:
+        diagnosis.findings.append(finding)
         return
     in_range = float(((valid >= MIN_DEPTH) & (valid <= MAX_DEPTH)).mean())
     if in_range < MIN_IN_RANGE:
@@ -119,38 +119,33 @@ def check_depth(
         diagnosis.add("depth-constant", message, "Check that the camera measures depth, and that its file is used.")
 
 
-def _check_focal_length(
-    diagnosis: Diagnosis, median: float, extents: list[float], mesh_sides: list[float], is_paired: bool
-) -> bool:
-    """Check the sizes of objects at a plausible distance against their meshes; return whether fx, fy are too small.
+def _wrong_focal_length(median: float, extents: list[float], sides: list[float], is_paired: bool) -> Finding | None:
+    """Compare the sizes of objects at a plausible distance with their meshes; return a finding if fx, fy are too small.
 
     Unless each object is paired with its own mesh, as many meshes as objects are compared in the order of their sizes;
-    otherwise, the longest mesh is the upper bound for all objects. `_check_unit` reports a single instance that is much
+    otherwise, the longest mesh is the upper bound for all objects. `_wrong_unit` reports a single instance that is much
     larger, since it may cover several objects.
     """
-    if not extents or not mesh_sides:
-        return False
+    if not extents or not sides or not MIN_DEPTH <= median <= MAX_DEPTH:
+        return None
     if not is_paired:
-        extents, mesh_sides = sorted(extents), sorted(mesh_sides)
-        mesh_sides = mesh_sides if len(mesh_sides) == len(extents) else mesh_sides[-1:] * len(extents)
-    ratios = np.divide(extents, mesh_sides)
+        extents, sides = sorted(extents), sorted(sides)
+        sides = sides if len(sides) == len(extents) else sides[-1:] * len(extents)
+    ratios = np.divide(extents, sides)
     ratio = float(np.median(ratios))
     if not MAX_RATIO < ratio <= (EXTENT_MARGIN if len(ratios) == 1 and not is_paired else MAX_FOCAL_FACTOR):
-        return False
-    diagnosis.add(
+        return None
+    return Finding(
         "intrinsics-focal",
         f"The objects would measure {ratio:.2g} times as much as their meshes (longest sides, median of {len(ratios)}) "
         f"at a distance of {_length(median)}.",
         f"If the distance is right, fx and fy are too small by a factor of about {ratio:.2g}: give the intrinsics of "
         "these images. If it is wrong, depth_scale is.",
     )
-    return True
 
 
-def _check_unit(
-    diagnosis: Diagnosis, frame: RGBDFrame, median: float, extents: list[float], mesh_sides: list[float]
-) -> bool:
-    """Check the unit of depth; return whether it is likely wrong."""
+def _wrong_unit(frame: RGBDFrame, median: float, extents: list[float], mesh_sides: list[float]) -> Finding | None:
+    """Return a finding if the unit of depth is likely wrong."""
     extent = float(np.median(extents)) if extents else None
     low, high, usual, of_meshes = MIN_EXTENT, MAX_EXTENT, USUAL_EXTENT, ""
     if mesh_sides:
@@ -158,7 +153,7 @@ def _check_unit(
         usual = float(np.median(mesh_sides))
         of_meshes = f"; the meshes measure {_length(min(mesh_sides))} to {_length(max(mesh_sides))}"
     if MIN_ROOM <= median <= MAX_ROOM if extent is None else low <= extent <= high:
-        return False
+        return None
     is_metric, is_usable = frame.depth.dtype.kind == "f", MIN_DEPTH <= median <= MAX_DEPTH
     distance = _length(median) + ("" if is_metric else f" with depth_scale {frame.intrinsics.depth_scale:g}")
     measured = f"The median depth would be {distance}"
@@ -186,14 +181,12 @@ def _check_unit(
     other = " If the distance is right, the focal length or the labels are wrong." if is_usable else ""
     advice = remedy if misfit(scale / best) < math.inf else rule + other
     if extent is not None and len(frame.instances) == 1 and extent > high and is_usable:
-        diagnosis.add(
+        return Finding(
             "labels-foreground",
             f"{measured}: the only number of the label image seems to cover several objects.",
             "Give each object a number of its own. If it is one object, the unit of depth is wrong: " + advice,
         )
-        return True
-    diagnosis.add("depth-unit", f"{measured}: the unit of depth is likely wrong.", advice)
-    return True
+    return Finding("depth-unit", f"{measured}: the unit of depth is likely wrong.", advice)
 
 
 def _length(metres: float) -> str:
