@@ -120,18 +120,15 @@ def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
 
 
 def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Iterator[Array]:
-    """Yield positions [2] in line with a placed object and the camera, with the taller one in front."""
+    """Return positions [2] in line with a placed object and the camera, with the taller one in front."""
     anchor = placed[int(rng.integers(len(placed)))]
     middle = (anchor.corners.min(axis=0) + anchor.corners.max(axis=0)) / 2
     sideways = np.array([-towards[1], towards[0]])
     # Offset sideways, so that an object is rarely occluded completely.
     middle = middle + sideways * rng.choice([-1, 1]) * rng.uniform(0.15, 0.45) * np.ptp(anchor.corners @ sideways)
     forth = towards if new.height > anchor.height else -towards
-    for distance in np.arange(0.0, 0.3, 0.006) + rng.uniform(0, 0.006):
-        place = middle + distance * forth
-        if np.linalg.norm(place) > 1.3 * TABLE_RADIUS:
-            return
-        yield place
+    places = middle + (np.arange(0.0, 0.3, 0.006) + rng.uniform(0, 0.006))[:, None] * forth
+    return itertools.takewhile(lambda place: np.linalg.norm(place) <= 1.3 * TABLE_RADIUS, places)
 
 
 def _anywhere(rng: np.random.Generator) -> Iterator[Array]:
@@ -234,11 +231,9 @@ def compose_views(
         InputError: there are fewer than `n_objects` objects.
     """
     meshes, azimuth, _ = _composed(objects, n_objects, clutter, rng)
-    views = []
-    for turn in np.arange(n_views) * arc / n_views:
-        pose = _random_pose(np.random.default_rng(0) if level else rng, azimuth + turn)
-        views.append((_render(meshes, pose, camera, noise, light, rng), pose))
-    return views
+    azimuths = azimuth + np.arange(n_views) * arc / n_views
+    poses = (_random_pose(np.random.default_rng(0) if level else rng, each) for each in azimuths)
+    return [(_render(meshes, pose, camera, noise, light, rng), pose) for pose in poses]
 
 
 def _composed(
