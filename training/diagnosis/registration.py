@@ -135,10 +135,8 @@ def _align(moved: Field, spectrum: Field) -> Alignment:
 
 def _zoomed(image: NDArray[Any], factor: float) -> NDArray[Any]:
     """Return an image enlarged about its centre, in an array of the same size; 0 outside."""
-    height, width = image.shape
-    rows, columns = (np.rint((np.arange(n) - (n - 1) / 2) / factor + (n - 1) / 2).astype(int) for n in (height, width))
-    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
-    return np.where(inside, image[np.clip(rows, 0, height - 1)][:, np.clip(columns, 0, width - 1)], 0)
+    places = [np.rint((np.arange(n) - (n - 1) / 2) / factor + (n - 1) / 2).clip(-1, n).astype(int) for n in image.shape]
+    return np.pad(image, (0, 1))[np.ix_(*places)]  # outside are the places -1 and n
 
 
 def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: NDArray[np.floating[Any]]) -> None:

@@ -305,13 +305,11 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
         path = _mesh_in(entry) if entry.is_dir() else entry if entry.suffix.lower() in MESH_SUFFIXES else None
         if path is not None and scans.setdefault(name, path) != path:
             raise InputError(f"mesh folder {folder}: scan {name!r} is there twice ({scans[name].name}, {path.name})")
-    if names is None:
-        if not scans:
-            raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
-        return _named(folder, scans)
-    if unknown := sorted(set(names.values()) - set(scans)):
+    if names is None and not scans:
+        raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
+    if unknown := sorted(set((names or {}).values()) - set(scans)):
         raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
-    return _named(folder, {name: scans[names[name]] for name in sorted(names)})
+    return _named(folder, scans if names is None else {name: scans[names[name]] for name in sorted(names)})
 
 
 def _named(folder: Path, meshes: Mapping[str, Path]) -> dict[str, Path]:

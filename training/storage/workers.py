@@ -57,8 +57,7 @@ def _map_ordered(
         pending.append(submit(item))
         if len(pending) > ahead:
             yield fetch(pending.popleft())
-    while pending:
-        yield fetch(pending.popleft())
+    yield from map(fetch, pending)
 
 
 def keep_freed_memory() -> None:
