@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -172,11 +173,9 @@ def _print_columns(header: Sequence[str], rows: Sequence[Sequence[str]], title: 
     widths = [max(map(cell_len, (*column[0].split(), *column[1:]))) + 3 for column in columns]
     start = 1
     while start < len(columns):
-        end = start + 1
-        while end < len(columns) and 1 + widths[0] + sum(widths[start : end + 1]) <= console.width:
-            end += 1
-        fits = 1 + widths[0] + widths[start] <= console.width
-        shown = Table(header[0], *header[start:end], title=title, folded=header[start:end] if fits else None)
+        n_fitting = sum(width <= console.width - 1 - widths[0] for width in itertools.accumulate(widths[start:]))
+        end = start + max(n_fitting, 1)
+        shown = Table(header[0], *header[start:end], title=title, folded=header[start:end] if n_fitting else None)
         for row in rows:
             if not row[1]:
                 shown.add_section()
