@@ -47,6 +47,7 @@ class _Answers:
 
     Attributes:
         failures: the `segmentation_failure` of each recognized frame.
+        n_frames: number of frames so far, with those that could not be recognized.
     """
 
     def __init__(self, given: OutputOptions, frames: Sequence[str], *, several: bool, as_json: bool) -> None:
@@ -67,7 +68,7 @@ class _Answers:
         self._given, self._frames, self._several, self._as_json = given, frames, several, as_json
         self._failed: list[str] = []
         self.failures: list[str] = []
-        self._has_unknown = False
+        self._has_unknown, self.n_frames = False, 0
         if given.out is not None:
             resumable = {name.split("/")[0] for name in frames} if several else {*result_files.RESULT_FILES}
             resumable |= {path.name for path in (given.coco, given.bop, given.rerun, given.out_bag) if path}
@@ -115,6 +116,7 @@ class _Answers:
                     out.rmdir()
         if frame is None and not self._several:
             raise InputError(str(answer.error))
+        self.n_frames += 1
         if self._as_json:
             print(json.dumps(answer.as_json()), flush=True)
         if frame is None:
@@ -140,11 +142,6 @@ class _Answers:
         given = self._given
         paths = given.out, given.out_bag, given.coco, given.bop, given.rerun
         return ", ".join(str(path) for path in paths if path and path.exists())
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames so far, with those that could not be recognized."""
-        return len(self.failures) + len(self._failed)
 
     def summarize(self, known: str, *command: str, **options: object) -> None:
         """Print where the answers are, `known` if an object is unknown, and the next command; refuse failed frames."""

@@ -49,6 +49,7 @@ class Alignment(NamedTuple):
     Attributes:
         right: columns by which the first field must be moved.
         down: rows by which the first field must be moved.
+        distance: length of the shift, pixels.
         peak: mean correlation at this shift; 1 is perfect.
         near: largest mean correlation at shifts up to `MAX_REGISTERED`.
         height: `peak` in standard deviations of the correlation at other shifts.
@@ -58,16 +59,12 @@ class Alignment(NamedTuple):
 
     right: int
     down: int
+    distance: float
     peak: float
     near: float
     height: float
     near_height: float
     n_edges: int
-
-    @property
-    def distance(self) -> float:
-        """Length of the shift, pixels."""
-        return float(np.hypot(self.right, self.down))
 
 
 def _gradient(image: NDArray[Any], sigma: float) -> Field:
@@ -130,7 +127,7 @@ def _align(moved: Field, spectrum: Field) -> Alignment:
     elsewhere = correlation[np.hypot(rows - down, columns - right) > 12]
     near, peak = float(correlation[np.hypot(rows, columns) <= MAX_REGISTERED].max()), float(correlation.max())
     spread = max(float(elsewhere.std()), 1e-9)
-    return Alignment(right, down, peak, near, peak / spread, near / spread, n_edges)
+    return Alignment(right, down, float(np.hypot(right, down)), peak, near, peak / spread, near / spread, n_edges)
 
 
 def _zoomed(image: NDArray[Any], factor: float) -> NDArray[Any]:
