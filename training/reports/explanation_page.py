@@ -1,6 +1,7 @@
 """The files of an explanation: a self-contained page, its pictures and JSON."""
 
 import base64
+import collections
 import itertools
 import json
 import re
@@ -71,13 +72,13 @@ def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, dir
         OSError: a file cannot be written; no files are left behind.
     """
     with atomic_directory(directory) as unfinished:
-        sections: dict[str, list[Picture]] = {}
+        sections = collections.defaultdict[str, list[Picture]](list)
         for picture in pictures(explanation, frame):
             file = unfinished / f"{picture.name}.png"
             save_figure(picture.figure, file)
             content = f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
             shown = Picture(content, picture.caption, "third" if picture.section == "slices" else "half")
-            sections.setdefault(picture.section, []).append(shown)
+            sections[picture.section].append(shown)
         write_text(unfinished / VALUES, json.dumps(explanation.as_json()) + "\n")
         title, lead = f"Why {explanation.title}?", _lead(explanation, name)
         write_page(unfinished / PAGE, title=title, lead=lead, sections=_page_sections(explanation, sections))
@@ -94,7 +95,7 @@ def _lead(explanation: Explanation, name: str) -> str:
     return f"Object {answer.label} in frame {name} {what}.{occluded}"
 
 
-def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]]) -> list[Section]:
+def _page_sections(explanation: Explanation, pictures: collections.defaultdict[str, list[Picture]]) -> list[Section]:
     check, name = explanation.attributions, explanation.name
     if explanation.scores.unit == "log-odds":
         answer = (
@@ -113,19 +114,17 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
         "together can matter more, or less, than the sum of their attributions; the exact check shows how large this "
         "difference is for the strips of this object."
     )
-    surfaces = [
-        Section("Does it fit the surfaces?", _SURFACES, _surfaces_table(explanation), pictures.get("surfaces", ()))
-    ]
-    resembling = [Section("What it resembles", pictures=pictures["nearest"])] if "nearest" in pictures else []
+    surfaces = [Section("Does it fit the surfaces?", _SURFACES, _surfaces_table(explanation), pictures["surfaces"])]
+    resembling = [Section("What it resembles", pictures=pictures["nearest"])] if pictures["nearest"] else []
     return [
         Section("The answer", answer, _answer_table(explanation.recognition)),
         Section("What decided", decided, pictures=pictures["decided"]),
         *(surfaces if explanation.surfaces else []),
-        Section("How little would change the answer", _changes_text(explanation), pictures=pictures.get("changes", ())),
+        Section("How little would change the answer", _changes_text(explanation), pictures=pictures["changes"]),
         *resembling,
         Section("If the name is wrong", _advice(explanation)),
         Section("What the descriptor sees", _SHAPE, pictures=pictures["shape"]),
-        Section("Slice by slice", _SLICES, pictures=pictures.get("slices", ())),
+        Section("Slice by slice", _SLICES, pictures=pictures["slices"]),
         Section("Its colours", pictures=pictures["network"]),
     ]
 
