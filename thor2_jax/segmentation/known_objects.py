@@ -135,9 +135,7 @@ def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> ND
         if not surfaces:
             break
         labels = _fitted(frame, labels, surfaces, region)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return renumbered(labels, sizes > 0)[0]
+    return renumbered(labels, np.bincount(labels[labels > 0], minlength=1) > 0)[0]
 
 
 def _fitted(
@@ -271,8 +269,7 @@ def _connected(clusters: NDArray[np.int32], mask: Mask, count: int) -> NDArray[n
     for cluster in range(1, count + 1):
         here, _ = components(clusters == cluster)
         numbers = np.where(here > 0, here + numbers.max(), numbers)
-    sizes = np.bincount(numbers.ravel())
-    sizes[0] = 0
+    sizes = np.bincount(numbers[numbers > 0])
     large = np.argsort(-sizes, kind="stable")[:MOST_PARTS]
     kept = large[sizes[large] >= min(LEAST_PART // 4, sizes.max())]
     rank = np.zeros(len(sizes), np.int32)

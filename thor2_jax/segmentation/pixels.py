@@ -64,12 +64,10 @@ def close(mask: Mask, size: int) -> Mask:
 def components(mask: Mask, connectivity: int = 4) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
     """Return the numbers [H, W] of the connected components, 0 outside the mask, and their sizes in pixels.
 
-    The size of number 0, the rest of the image, is set to 0.
+    The size of number 0, the rest of the image, is 0.
     """
-    count, numbers = cv2.connectedComponents(_bytes(mask), connectivity=connectivity)
-    sizes = np.bincount(numbers.ravel(), minlength=count)
-    sizes[0] = 0
-    return np.asarray(numbers, np.int32), sizes
+    numbers = np.asarray(cv2.connectedComponents(_bytes(mask), connectivity=connectivity)[1], np.int32)
+    return numbers, np.bincount(numbers[mask], minlength=1)
 
 
 def renumbered(numbers: NDArray[np.int32], kept: Mask, last: int = 0) -> tuple[NDArray[np.int32], int]:
