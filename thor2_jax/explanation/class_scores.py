@@ -22,7 +22,7 @@ from colornet import ColorNetwork
 from thor2_jax.capacity import batch_points
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.looks import LookDescriptors, aligned_looks, describe_aligned_looks, describe_looks
+from thor2_jax.descriptor.looks import LookDescriptors, aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import LOOKS
@@ -88,9 +88,8 @@ class ClassScores:
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
         """Return the scores [B, n] of instances, each in its own frames, as in recognition."""
-        rows = packed(instances)
-        described = (self._complete(describe_looks(row, self.network, self.config, self.count), row) for row in rows)
-        return self._of_rows(described, len(instances))
+        rows = (aligned_looks(row, self.config, self.count) for row in packed(instances))
+        return self._of_rows(rows, len(instances))
 
     def of_masks(self, looks: PointClouds, masks: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Return the exact scores [B, n] of parts of a cloud in the frames of the whole cloud.
@@ -103,21 +102,19 @@ class ClassScores:
         padded = np.pad(masks, ((0, -n_parts % ROWS), (0, repeated.mask.shape[1] - n_points)))
         rows = padded.repeat(self.count, axis=0).reshape(-1, *repeated.mask.shape)
         parts = (dataclasses.replace(repeated, mask=repeated.mask & row) for row in rows)
-        described = (self.describe(part, strips(part, self.network, self.config), self.config) for part in parts)
-        return self._of_rows(described, n_parts)
+        return self._of_rows(parts, n_parts)
 
     def describe(self, aligned: PointClouds, cut: Strips, config: DescriptorConfig) -> LookDescriptors:
         """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
-        first: PointClouds = jax.tree.map(lambda a: a[:: self.count], aligned)
-        return self._complete(describe_aligned_looks(aligned, cut, self.network, config, self.count), first)
+        oriented = describe_aligned_looks(aligned, cut, self.network, config, self.count)
+        if self.unit == "log-odds":  # The programs of classifiers are those of recognition.
+            return oriented
+        return oriented.with_balanced(jax.tree.map(lambda a: a[:: self.count], aligned))
 
-    def _complete(self, oriented: LookDescriptors, clouds: PointClouds) -> LookDescriptors:
-        """Add what only galleries read: the programs of classifiers are those of recognition without it."""
-        return oriented.with_balanced(clouds) if self.unit == "similarity" else oriented
-
-    def _of_rows(self, rows: Iterable[LookDescriptors], count: int) -> NDArray[np.float32]:
-        """Return the scores [B, n] of the first B clouds, which are described `ROWS` at a time."""
-        scores = [np.asarray(self.of_descriptors(row)) for row in rows]
+    def _of_rows(self, rows: Iterable[PointClouds], count: int) -> NDArray[np.float32]:
+        """Return the exact scores [B, n] of the first B clouds from their looks, for `ROWS` clouds at a time."""
+        described = (self.describe(row, strips(row, self.network, self.config), self.config) for row in rows)
+        scores = [np.asarray(self.of_descriptors(each)) for each in described]
         return np.concatenate(scores)[:count, : len(self.names)]
 
 
