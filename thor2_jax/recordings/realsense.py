@@ -107,11 +107,6 @@ class RealSenseCamera:
 
 def _intrinsics(color: Any, depth: Any) -> Intrinsics:
     camera = color.get_profile().as_video_stream_profile().get_intrinsics()
-    return Intrinsics.of(
-        {
-            **{name: getattr(camera, name) for name in ("fx", "fy", "ppx", "ppy", "width", "height")},
-            "model": str(camera.model),
-            "coeffs": list(camera.coeffs),
-            "depth_scale": round(float(depth.get_units()), 9),
-        }
-    )
+    names = ("fx", "fy", "ppx", "ppy", "width", "height", "model", "coeffs")
+    values = {name: getattr(camera, name) for name in names}
+    return Intrinsics.of({**values, "depth_scale": round(float(depth.get_units()), 9)})
