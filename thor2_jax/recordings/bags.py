@@ -135,17 +135,15 @@ class Bag:
                 if self.is_truncated:
                     self._reader.storage.path = SimpleNamespace(open=lambda _: _CompleteRecords(io.FileIO(self.path)))
                 self._deserialize = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
-            self._reader.open()
-            try:
+            with contextlib.ExitStack() as stack:
+                stack.enter_context(self._reader)
                 self._choose()
-            except BaseException:
-                self._reader.close()
-                raise
+                self._opened = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Close the recording."""
-        self._reader.close()
+        self._opened.close()
         self._reader = None
 
     def frames(self) -> Iterator[RecordedFrame]:
