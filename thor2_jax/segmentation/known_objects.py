@@ -108,10 +108,10 @@ def segment_known(
     things = {frozenset([number]) for number in beside}
     while merged := _merged(things, beside, known):
         things = merged
-    result = np.zeros(labels.shape, np.int32)
-    for number, thing in enumerate(sorted(things, key=min), start=1):
-        result[_mask(divided, thing)] = number
-    return fit_masks(frame, result, locate)
+    number_of = np.zeros(divided.max() + 1, np.int32)
+    for thing in things:
+        number_of[list(thing)] = min(thing)
+    return fit_masks(frame, number_of[divided], locate)
 
 
 def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> NDArray[np.int32]:
@@ -123,7 +123,7 @@ def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> ND
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
-        labels: [H, W]; 0 is background, and the objects are numbered from 1.
+        labels: [H, W]; 0 is background, every other number an object.
         locate: see `Locate`.
 
     Returns:

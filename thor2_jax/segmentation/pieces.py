@@ -5,8 +5,6 @@ colour edges. Near depth edges and where depth is missing, the colour image alon
 edge between them, and the inner and outer sides of hollow objects, are then merged.
 """
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -206,9 +204,8 @@ def _belong_together(pieces: _Pieces, apart: Mask) -> Mask:
     a, b = pieces.pairs.T
     part_by_color = (pieces.colored[a] != pieces.colored[b]) & (pieces.tall[a] | pieces.tall[b])
     is_part = (pieces.contrast < PART) | _main_contact(pieces, part_by_color)
-    cases = [part_by_color, pieces.low[a] & pieces.low[b], apart]
-    answers: list[Any] = [is_part, True, False]
-    return np.select(cases, answers, pieces.step < EDGE)
+    is_one_body = (pieces.low[a] & pieces.low[b]) | (~apart & (pieces.step < EDGE))
+    return np.where(part_by_color, is_part, is_one_body)
 
 
 def _main_contact(pieces: _Pieces, parts: Mask) -> Mask:
