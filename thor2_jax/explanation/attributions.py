@@ -179,8 +179,7 @@ def leave_out(scores: ClassScores, looks: PointClouds, index: int, attributions:
     """
     config, n = scores.config, len(attributions)
     x, _, z = looks.points[0, :n].T
-    numbers = slices_and_strips(x, z, looks.mask[0, :n], config)
-    slice_of, strip_of = (np.asarray(number) for number in numbers)
+    slice_of, strip_of = map(np.asarray, slices_and_strips(x, z, looks.mask[0, :n], config))
     inside = (slice_of < config.n_slices) & (strip_of < config.n_strips)
     cell_of = np.where(inside, slice_of * config.n_strips + strip_of, -1)
     cells, used_slices = np.unique(cell_of[inside]), np.unique(slice_of[inside])

@@ -154,11 +154,9 @@ def _fitted(
     tidied = np.zeros_like(labels)  # without small separate pieces of changed objects
     for label in np.unique(fitted[fitted > 0]):
         mask = fitted == label
-        numbers, sizes = mask.astype(np.int32), np.array([0, mask.sum()])
-        if (mask != (labels == label)).any():
-            numbers, sizes = components(mask)
-        kept = sizes >= (LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()))
-        numbers, _ = renumbered(numbers, kept, label - 1)
+        numbers, sizes = components(mask)
+        least = min(LEAST_PIXELS, sizes.max()) if (mask != (labels == label)).any() else 1
+        numbers, _ = renumbered(numbers, sizes >= (LEAST_PIXELS if label == rest else least), label - 1)
         tidied += numbers if label == rest else np.minimum(numbers, label)
     tidied = np.where((fitted == rest) & (tidied == 0), labels, tidied)  # too few for a piece: they stay
     return filled(tidied, (labels > 0) | (tidied > 0))

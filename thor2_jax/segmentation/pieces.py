@@ -140,8 +140,7 @@ def _flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> t
     high = evidence.high | (close(evidence.high, 5) & ~depth.valid)
     markers, n_bodies = _body_markers(high, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
     body_numbers, body_sizes = components(high)
-    marked = np.zeros(len(body_sizes), bool)
-    marked[body_numbers[markers > 0]] = True
+    marked = np.bincount(body_numbers[markers > 0], minlength=len(body_sizes)) > 0
     alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that consist of rim only
     rest, n_bodies = renumbered(body_numbers, alone, n_bodies)
     markers += rest
