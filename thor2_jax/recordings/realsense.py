@@ -90,10 +90,8 @@ class RealSenseCamera:
             gap = round(depth.get_timestamp() * 1e6) - stamp
             # The camera reuses the memory of its images.
             pixels, units = np.array(color.get_data(), np.uint8), np.array(depth.get_data(), np.uint16)
-            intrinsics = _intrinsics(color, depth)
-            yield RecordedFrame(
-                stamp_name(stamp), functools.partial(RGBDFrame, pixels, units, None, intrinsics), stamp, gap
-            )
+            read = functools.partial(RGBDFrame, pixels, units, None, _intrinsics(color, depth))
+            yield RecordedFrame(stamp_name(stamp), read, stamp, gap)
 
     def _next(self) -> tuple[Any, Any]:
         """Return the next colour frame and the depth frame aligned to it; raise RuntimeError if none arrives."""
