@@ -308,10 +308,8 @@ def _merged(things: set[Parts], beside: dict[int, set[int]], known: _Known) -> s
     at = {part: thing for thing in things for part in thing}
     touching = {(at[part], at[other]) for part in at for other in beside[part] if min(at[part]) < min(at[other])}
     known.look_at(sorted({thing for pair in touching for thing in pair}, key=min))
-    pairs = sorted(
-        ((a, b) for a, b in touching if len({known.name[a], known.name[b]} - {None}) < 2),
-        key=lambda pair: [min(each) for each in pair],
-    )
+    pairs = [(a, b) for a, b in touching if len({known.name[a], known.name[b]} - {None}) < 2]
+    pairs.sort(key=lambda pair: [min(each) for each in pair])
     known.look_at([a | b for a, b in pairs])
     gains = {
         (a, b): known.odds[a | b] - max(known.odds[a], known.odds[b])

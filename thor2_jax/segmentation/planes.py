@@ -65,8 +65,7 @@ class DepthImage:
         """Prepare a depth image `depth_m` [H, W] in metres."""
         self.valid: Mask = (depth_m >= MIN_DEPTH) & (depth_m <= MAX_DEPTH)
         self.z = depth_m * self.valid
-        self.inverse = np.zeros_like(self.z)
-        np.divide(1, self.z, out=self.inverse, where=self.valid)
+        self.inverse = np.divide(1, self.z, out=np.zeros_like(self.z), where=self.valid)
         height, width = self.z.shape
         self.x = ((np.arange(width) - intrinsics.cx) / intrinsics.fx).astype(np.float32)
         self.y = ((np.arange(height) - intrinsics.cy) / intrinsics.fy).astype(np.float32)
