@@ -101,8 +101,7 @@ def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) 
         mask = numbers == sizes.argmax()
         if _is_thing(mask, depth.z[place], depth, region[place]):
             count += 1
-            free = (labels[place] == label) | (labels[place] == 0)
-            cleaned[place][_without_holes(mask) & free] = count
+            cleaned[place][_without_holes(mask) & np.isin(labels[place], (0, label))] = count
     return cleaned
 
 
@@ -119,4 +118,4 @@ def _without_holes(mask: Mask) -> Mask:
     numbers, sizes = components(np.pad(~mask, 1, constant_values=True))
     sizes[1] = 0  # the first pixel is outside
     filled = (sizes > 0) & (sizes < HOLE * mask.sum())
-    return mask | filled[numbers[1:-1, 1:-1]] if filled.any() else mask
+    return mask | filled[numbers[1:-1, 1:-1]]
