@@ -273,11 +273,9 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
 async def _check_same_site(request: Request) -> None:
     """Raise RequestError (403) if a web page of another site sent the request, which browsers allow."""
     site, origin = request.headers.get("sec-fetch-site"), request.headers.get("origin")
-    if site is not None:  # Browsers send this header to https and to localhost.
-        is_foreign = site not in ("same-origin", "none")
-    else:
-        is_foreign = origin is not None and origin.partition("://")[2] != request.headers.get("host")
-    if is_foreign:
+    if site is None:  # Browsers send this header only to https and to localhost.
+        site = "none" if origin is None or origin.partition("://")[2] == request.headers.get("host") else "cross-site"
+    if site not in ("same-origin", "none"):
         raise RequestError(403, "Origin", "The request comes from a web page of another site.")
 
 
