@@ -84,12 +84,11 @@ def explained_frame(
         timings: stage -> milliseconds.
     """
     assert prepared.label_map is not None
-    remaining = iter(results)
+    shown = iter(results[: schemas.MAX_EXPLAINED])
     instances: list[schemas.ExplainedInstance] = []
     for instance, recognition in zip(prepared.instances, recognitions, strict=True):
-        result = next(remaining) if instance.reason is None else None
-        is_shown = sum(each.details is not None for each in instances) < schemas.MAX_EXPLAINED
-        details = _details(model, instance, result, recognition) if result and is_shown else None
+        result = next(shown, None) if instance.reason is None else None
+        details = None if result is None else _details(model, instance, result, recognition)
         instances.append(schemas.ExplainedInstance(**dict(instance_answer(recognition)), details=details))
     known: dict[str, Any] = {"knows": model.gallery.summary, "classes": list(model.names)}
     return schemas.ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings, **known)
