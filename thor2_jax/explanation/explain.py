@@ -248,8 +248,7 @@ def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_s
     instance = PreparedInstance(1, points, rng.integers(0, 256, (n_points, 3), np.uint8), np.zeros(n_points, bool))
     _recognized(model, [instance])
     scores = _scores(model, by_classifiers)
-    best_first = np.argsort(-scores.of_instances([instance])[0], kind="stable")
-    parts = _parts(model, scores, instance, [scores.names[k] for k in best_first])
+    parts = _parts(model, scores, instance, scores.names)
     while not is_stopped() and next(parts, None) is not None:
         pass
 
