@@ -26,16 +26,13 @@ from thor2_jax.printable import check_name
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import FORM, MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_POINTS, CloudsBody
 
-__all__ = ["check_instances", "decode_frame", "decode_json_clouds", "decode_npz_clouds", "read_body", "read_form"]
+__all__ = ["decode_frame", "decode_json_clouds", "decode_npz_clouds", "read_body", "read_form"]
 
 MAX_BODY = 16 * 2**20
 """Largest size of a request body, and of the arrays it decompresses to, in bytes."""
 
 MAX_UPLOAD_PIXELS = 1920 * 1080
 """Largest number of pixels of an image."""
-
-MAX_INSTANCES = 256
-"""Largest number of instances in a frame."""
 
 MAX_INTRINSICS_BYTES = 4096
 """Largest size of the intrinsics file."""
@@ -167,18 +164,7 @@ def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | 
     }
     fields = _parse_fields(parsers)
     with field_errors():
-        frame = RGBDFrame(**fields | {"color": np.ascontiguousarray(fields["color"][..., :3])})
-    if labels is not None:
-        check_instances(frame)
-    return frame
-
-
-def check_instances(frame: RGBDFrame) -> None:
-    """Raise RequestError (422) if the labels of a frame have more than `MAX_INSTANCES` instances."""
-    with field_errors("labels"):
-        count = len(frame.instances)
-    if count > MAX_INSTANCES:
-        raise RequestError(422, "labels", f"labels has {count} instances; expected at most {MAX_INSTANCES}.")
+        return RGBDFrame(**fields | {"color": np.ascontiguousarray(fields["color"][..., :3])})
 
 
 def _decode_intrinsics(content: bytes) -> Intrinsics:

@@ -22,11 +22,14 @@ from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, prepare_instance
 from thor2_jax.processes import Processes
 from thor2_jax.segmentation.segmenters import load_segmenter, segmented
-from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
+from thor2_jax.service.decoding import decode_frame, decode_json_clouds, decode_npz_clouds
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 
 __all__ = ["PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "start_processes", "timed"]
+
+MAX_INSTANCES = 256
+"""Largest number of instances in a frame."""
 
 MAX_LABEL_RUNS = 50_000
 """Largest number of runs in the label map of an explained frame."""
@@ -63,7 +66,8 @@ def prepare_frame(
     """Decode a frame, segment it if it has no labels, and compute the clouds of its instances.
 
     Raises:
-        RequestError: 422 if there are no labels and no segmenter, 500 if the segmenter fails; also as `decode_frame`.
+        RequestError: 422 if there are no labels and no segmenter, or more than `MAX_INSTANCES` instances; 500 if the
+            segmenter fails; also as `decode_frame`.
     """
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
@@ -73,9 +77,15 @@ def prepare_frame(
             frame = _segmented(frame, segmenter)
         with_label_map = True
     with timed(seconds, "clouds"), field_errors():
+        _check_instances(frame)
         instances = [prepare_instance(frame, k, config.sigma_s) for k in frame.instances]
         label_map = _encode_label_map(frame.label_image) if with_label_map else None
     return PreparedRequest(instances, seconds, label_map)
+
+
+def _check_instances(frame: RGBDFrame) -> None:
+    if (count := len(frame.instances)) > MAX_INSTANCES:
+        raise InputError(f"labels has {count} instances; expected at most {MAX_INSTANCES}")
 
 
 _segmenter = functools.cache(load_segmenter)
@@ -86,11 +96,9 @@ def _segmented(frame: RGBDFrame, name: str | None) -> RGBDFrame:
     if name is None:
         raise RequestError(422, "labels", "labels is missing; this service has no segmenter (thor2 serve --segment).")
     try:
-        frame = segmented(frame, _segmenter(name))
+        return segmented(frame, _segmenter(name))
     except InputError as error:
         raise RequestError(500, "labels", f"{error}, or send labels.") from None
-    check_instances(frame)
-    return frame
 
 
 def _warm_up(name: str | None) -> None:
@@ -113,6 +121,7 @@ def prepare_view(fields: dict[str, Any], config: DescriptorConfig) -> PreparedRe
     with timed(seconds, "decode"):
         frame = decode_frame(**{name: fields[name] for name in ("color", "depth", "intrinsics", "labels")})
     with timed(seconds, "clouds"), field_errors():
+        _check_instances(frame)
         view = instance_view(frame, fields["instance"], config.sigma_s)
     return PreparedRequest([view], seconds, frame=frame)
 
