@@ -6,7 +6,6 @@ with DetectionBag(Path("answers.mcap")) as bag, RerunFile(Path("answers.rrd")) a
 """
 
 import contextlib
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -128,8 +127,8 @@ class MessageBag:
         with self._stack, _file_errors(self._path):
             self._writer.close()
             if self._n_messages:
-                is_file = self._path.suffix == ".mcap"
-                os.replace(next(self._bag.glob("*.mcap")) if is_file else self._bag, self._path)
+                written = next(self._bag.glob("*.mcap")) if self._path.suffix == ".mcap" else self._bag
+                written.replace(self._path)
 
     def write_message(self, topic: str, fields: Mapping[str, Any], stamp: int) -> None:
         """Write a message with the recording time `stamp` (ns), or 0 if it is negative.
