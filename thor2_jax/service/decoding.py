@@ -5,7 +5,6 @@ field.
 """
 
 import io
-import re
 import zipfile
 from collections.abc import AsyncGenerator, Callable, Mapping
 from functools import partial
@@ -113,7 +112,7 @@ def _parse_flag(field: str, text: str) -> bool:
 
 
 def _parse_number(field: str, text: str) -> int:
-    if not re.fullmatch("[0-9]{1,18}", text):
+    if not (text.isascii() and text.isdecimal() and len(text) <= 18):
         raise RequestError(422, field, f"{field} is {text[:40]!r}; expected a whole number of at most 18 digits.")
     return int(text)
 
