@@ -5,7 +5,6 @@ import io
 import secrets
 from collections.abc import AsyncIterator, Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -87,7 +86,7 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     _add_model_routes(authenticated, service)
     _add_teaching_routes(authenticated, service)
     app.include_router(authenticated)
-    app.router.default = StaticFiles(directory=Path(__file__).parent / "page", html=True)
+    app.router.default = StaticFiles(packages=[("thor2_jax.service", "page")], html=True)
     for kind in (RequestError, HTTPException, ClientDisconnect, Exception):
         app.add_exception_handler(kind, _on_error)
     return app

@@ -2,7 +2,6 @@
 
 import functools
 import os
-from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.multiprocess import MultiProcessCollector
@@ -24,7 +23,7 @@ class Metrics:
         if directory := os.environ.get("PROMETHEUS_MULTIPROC_DIR"):
             # The files are mapped: without their blocks, a disk that becomes full would end this process by SIGBUS.
             for kind in ("counter", "gauge_livesum", "histogram"):
-                write_bytes(Path(directory) / f"{kind}_{os.getpid()}.db", bytes(2**16))
+                write_bytes(f"{directory}/{kind}_{os.getpid()}.db", bytes(2**16))
         registry = self._registry = CollectorRegistry()
         gauge = functools.partial(Gauge, registry=registry, multiprocess_mode="livesum")
         counter = functools.partial(Counter, registry=registry)
