@@ -72,6 +72,7 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
         description="Recognition of the objects in an RGB-D frame with an instance segmentation.",
         lifespan=lifespan,
         responses=error_responses(403),
+        exception_handlers=dict.fromkeys((RequestError, HTTPException, ClientDisconnect, Exception), _on_error),
         docs_url=None,  # The interactive documentation loads scripts from another server.
         redoc_url=None,
     )
@@ -87,8 +88,6 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     _add_teaching_routes(authenticated, service)
     app.include_router(authenticated)
     app.router.default = StaticFiles(packages=[("thor2_jax.service", "page")], html=True)
-    for kind in (RequestError, HTTPException, ClientDisconnect, Exception):
-        app.add_exception_handler(kind, _on_error)
     return app
 
 
