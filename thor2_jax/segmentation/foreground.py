@@ -105,8 +105,7 @@ def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
     Shadows and highlights are connected to the plane without an edge, unlike objects.
     """
     numbers, sizes = components(smooth)
-    plain = np.bincount(numbers[like_plane], minlength=len(sizes)) > 0.5 * sizes
-    plain[0] = False
+    plain = np.bincount(numbers[smooth & like_plane], minlength=len(sizes)) > 0.5 * sizes
     return grow(plain[numbers], 3)
 
 
