@@ -14,8 +14,8 @@ from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.model.run_record import run_directories
 from thor2_jax.printable import normal_name
 from training.baselines.baseline import baseline_file
-from training.baselines.cloud_baselines import types_of_views
 from training.baselines.job import check_baselines, crop_size, train_baselines
+from training.baselines.thor import types_of_views
 from training.fitting.loop import wait_for_all
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes

@@ -13,6 +13,7 @@ from thor2_jax.files import locked, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines import cloud_baselines as clouds
 from training.baselines import image_baselines as images
+from training.baselines import thor
 from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file
 from training.baselines.image_baselines import ARCHITECTURES, TEMPLATES
 from training.storage.jobs import Progress, add_prefix
@@ -53,7 +54,7 @@ TITLES = {
 Load = Callable[[Mapping[str, Any], TrainedRun], Predictor]
 
 _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
-    "thor": (clouds.fit_thor, clouds.load_thor),
+    "thor": (thor.fit_thor, thor.load_thor),
     "forest": (clouds.fit_forest, clouds.load_forest),
     "pointnet": (clouds.fit_pointnet, clouds.load_pointnet),
     **{name: (images.fit_image_network, functools.partial(images.load_image_network, name)) for name in ARCHITECTURES},

@@ -15,7 +15,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.types import Cloud
-from training.baselines import cloud_baselines, job
+from training.baselines import job, thor
 from training.baselines.baseline import BaselineInputs, FitTask, StoredBaseline, baseline_file
 from training.baselines.cloud_baselines import load_forest
 from training.baselines.job import CLOUD_BASELINES, check_baselines, load_baselines, train_baselines
@@ -100,7 +100,7 @@ def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.Mon
 def test_each_view_type_has_every_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All views of a class from above are held out, as can happen to a few random ones."""
     above, trained = (
-        np.array(["top" in types for types in cloud_baselines.types_of_views(SOURCE.record["job"])]),
+        np.array(["top" in types for types in thor.types_of_views(SOURCE.record["job"])]),
         list[Any](),
     )
 
@@ -108,7 +108,7 @@ def test_each_view_type_has_every_class(tmp_path: Path, monkeypatch: pytest.Monk
         trained.append(set(samples.label[rows[~args[3][rows]]]))
         return random_classifier(64, 2, 0), 1
 
-    monkeypatch.setattr(cloud_baselines, "fit", fit)
+    monkeypatch.setattr(thor, "fit", fit)
     monkeypatch.setattr(FitTask, "held_out", lambda task, label, view: (label == 1) & above[view])
     train_baselines(write_run(tmp_path / "run"), SOURCE, ["thor"])
     assert trained == [{0, 1}] * 3
