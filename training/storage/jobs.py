@@ -155,7 +155,8 @@ def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mappin
     Raises:
         InputError: the records differ; the message names the first different field and both values.
     """
-    for field, old, new in _differences("", stored, json.loads(json.dumps(requested))):
+    if difference := next(_differences("", stored, json.loads(json.dumps(requested))), None):
+        field, old, new = difference
         raise InputError(
             f"out: {directory} was written with {field} {_shown(old)}, not {_shown(new)}; "
             "repeat the command with the same options and unchanged files, or choose another directory"
