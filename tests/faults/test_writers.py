@@ -23,7 +23,7 @@ from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines.baseline import StoredBaseline
 from training.evaluation.answers import AnswerFile, FrameAnswers
-from training.evaluation.job import draw_judged
+from training.evaluation.frame_pictures import draw_judged
 
 
 class Disk:

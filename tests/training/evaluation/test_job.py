@@ -199,7 +199,7 @@ def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
 
 
 def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:
-    from training.evaluation.job import CORRECT, INCORRECT, draw_crop, draw_judged
+    from training.evaluation.frame_pictures import CORRECT, INCORRECT, draw_crop, draw_judged
 
     color, labels = np.full((60, 90, 3), 128, np.uint8), np.zeros((60, 90), np.uint8)
     labels[20:50, 5:40] = 1
