@@ -4,6 +4,8 @@ import contextlib
 import multiprocessing
 import re
 import signal
+import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 from processes import HANG, call_pickled
 
 from thor2_jax.errors import InputError
+from thor2_jax.processes import Processes
 
 
 @contextlib.contextmanager
@@ -44,48 +47,30 @@ def measured(read: Callable[[], Any], refusals: Any) -> tuple[Any, str | None, i
     return result, message, memory("VmHWM") - before
 
 
-class ReaderProcess:
-    """Call functions in another process, which is replaced if one of them hangs.
-
-    Attributes:
-        seconds: after these a function hangs.
-        memory: bytes that a reader may take beyond what the process holds.
-    """
-
-    seconds, memory = HANG, 2**30
-
-    def __init__(self) -> None:
-        self.start()
-
-    def start(self) -> None:
-        # A forked process could deadlock on the locks of the threads of JAX.
-        self.pool = multiprocessing.get_context("spawn").Pool(1, signal.signal, (signal.SIGINT, signal.SIG_IGN))
-
-    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        try:
-            return self.pool.apply_async(call_pickled, (cloudpickle.dumps((function, arguments)),)).get(self.seconds)
-        except multiprocessing.TimeoutError:
-            self.pool.terminate()
-            self.start()
-            raise AssertionError(f"the reader crashed, or has not returned after {self.seconds} s") from None
-
-
 @pytest.fixture(scope="session")
-def reader_process() -> Iterator[ReaderProcess]:
-    process = ReaderProcess()
+def reader_process() -> Iterator[Processes]:
+    """A process that is replaced if a function hangs or ends it; a forked one could deadlock on the locks of JAX."""
+    process = Processes(1, multiprocessing.get_context("spawn"), int, signal.SIGINT)
     yield process
-    process.pool.close()  # The process ends by itself, which writes its coverage.
-    process.pool.join()
+    with contextlib.suppress(ChildProcessError):
+        process.submit(sys.exit).result()  # The process ends by itself, which writes its coverage.
+    process.close()
 
 
 @pytest.fixture
-def attempt(reader_process: ReaderProcess, request: pytest.FixtureRequest) -> Callable[..., Any]:
-    """Return a function that calls a reader and returns its result, or None if it raises one line."""
+def attempt(reader_process: Processes, request: pytest.FixtureRequest) -> Callable[..., Any]:
+    """Return a function that calls a reader and returns its result, or None if it raises one line.
+
+    The reader may take `seconds`, and `most` bytes beyond what its process holds.
+    """
     cloudpickle.register_pickle_by_value(request.module)  # the process cannot import functions of test files
 
-    def call(read: Callable[[], Any], refusals: Any = (InputError, OSError)) -> Any:
-        result, message, memory = reader_process(measured, read, refusals)
-        assert memory < reader_process.memory, f"the reader takes {memory} bytes"
+    def call(
+        read: Callable[[], Any], refusals: Any = (InputError, OSError), seconds: float = HANG, most: float = 2**30
+    ) -> Any:
+        content, deadline = cloudpickle.dumps((measured, (read, refusals))), time.monotonic() + seconds
+        result, message, memory = reader_process.submit(call_pickled, content, deadline=deadline).result()
+        assert memory < most, f"the reader takes {memory} bytes"
         assert message is None or (message and "\n" not in message and len(message) < 20_000), message[:3000]
         return result
 
