@@ -28,7 +28,6 @@ from thor2_jax.figures import png_bytes
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.recognizer import Recognizer
 from thor2_jax.surfaces.evidence import sample_points, search_poses
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
@@ -52,12 +51,12 @@ INSTANCE = prepare_instance(FRAME, 3, FOUR.sigma_s)
 
 
 @pytest.fixture(scope="module")
-def recognizer() -> Recognizer:
-    return Recognizer(untrained_run(CLASSES, config=FOUR))
+def recognizer() -> thor2.Recognizer:
+    return thor2.Recognizer(untrained_run(CLASSES, config=FOUR))
 
 
 @pytest.fixture(scope="module")
-def explanation(recognizer: Recognizer) -> Explanation:
+def explanation(recognizer: thor2.Recognizer) -> Explanation:
     return explain(recognizer, FRAME, 3)
 
 
@@ -75,7 +74,7 @@ def toy(score: Callable[[LookDescriptors], Any]) -> ClassScores:
 @pytest.mark.parametrize("rule", ["log-mean", *slow("max", "mean")])
 @pytest.mark.parametrize("make_run", [untrained_run, *slow(untrained_embedding_run)])
 def test_margin_is_the_log_odds_of_the_answer(rule: str, make_run: Callable[..., TrainedRun]) -> None:
-    recognizer = Recognizer(make_run(CLASSES, config=FOUR), rule=rule)
+    recognizer = thor2.Recognizer(make_run(CLASSES, config=FOUR), rule=rule)
     (answer,) = [one for one in recognizer.recognize(FRAME) if one.label == 3]
     scores = classifier_scores(recognizer.model)
     values = scores.of_instances([INSTANCE])
@@ -89,7 +88,7 @@ def test_margin_is_the_log_odds_of_the_answer(rule: str, make_run: Callable[...,
 @pytest.mark.slow
 def test_the_margin_of_a_calibrated_answer_is_that_among_the_classes() -> None:
     record = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.0))}
-    recognizer = Recognizer(untrained_embedding_run(CLASSES, config=FOUR, record=record))
+    recognizer = thor2.Recognizer(untrained_embedding_run(CLASSES, config=FOUR, record=record))
     explanation = explain(recognizer, FRAME, 3)
     (answer,) = [one for one in recognizer.recognize(FRAME) if one.label == 3]
     assert explanation.name == answer.name and set(explanation.recognition.top) == {"embedding"}
@@ -103,7 +102,7 @@ def test_the_margin_of_a_calibrated_answer_is_that_among_the_classes() -> None:
 @pytest.mark.parametrize("looks", [*slow(1, 2), 4])
 def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int) -> None:
     run = untrained_embedding_run(CLASSES, config=dataclasses.replace(SMALL_CONFIG, looks=looks))
-    recognizer = Recognizer(run)
+    recognizer = thor2.Recognizer(run)
     recognizer.enroll("mixed", [(FRAME, 3)])
     instances, inference = recognizer.infer(recognizer.prepare(FRAME))
     usable = [one for one in instances if one.reason is None]
@@ -115,7 +114,7 @@ def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int) -> None:
 
 
 def test_forgotten_classes_have_no_score() -> None:
-    recognizer = Recognizer(untrained_run(CLASSES, config=FOUR))
+    recognizer = thor2.Recognizer(untrained_run(CLASSES, config=FOUR))
     whole = classifier_scores(recognizer.model).of_instances([INSTANCE])
     recognizer.forget("b")
     scores = classifier_scores(recognizer.model)
@@ -156,7 +155,7 @@ def test_a_left_out_slice_is_an_empty_slice() -> None:
 
 
 @pytest.mark.slow
-def test_attributions_are_complete(recognizer: Recognizer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attributions_are_complete(recognizer: thor2.Recognizer, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean gradient on the path, summed over the points, is the slope of the margin from half to whole weights."""
     monkeypatch.setattr(attributions, "STEPS", 32)
     scores = classifier_scores(recognizer.model)
@@ -245,7 +244,7 @@ def test_changed_extents_keep_the_other_sides() -> None:
 
 
 @pytest.mark.slow
-def test_an_explanation_has_its_parts(explanation: Explanation, recognizer: Recognizer) -> None:
+def test_an_explanation_has_its_parts(explanation: Explanation, recognizer: thor2.Recognizer) -> None:
     """Its check removes the most attributed tenth; pixels have the value of their point."""
     (answer,) = [one for one in recognizer.recognize(FRAME) if one.label == 3]
     assert explanation.name == answer.name and explanation.runner_up in set(CLASSES) - {answer.name}
@@ -276,7 +275,7 @@ def test_an_explanation_has_its_parts(explanation: Explanation, recognizer: Reco
 
 @pytest.mark.slow
 def test_gallery_answers_are_explained() -> None:
-    recognizer = Recognizer(untrained_run((), features=()))
+    recognizer = thor2.Recognizer(untrained_run((), features=()))
     recognizer.enroll("red", [(FRAME, 7)])
     recognizer.enroll("mixed", [(FRAME, 3)])
     explanation = explain(recognizer, FRAME, 3)
@@ -291,7 +290,7 @@ def test_gallery_answers_are_explained() -> None:
 def test_an_instance_is_compared_with_the_surfaces_of_objects(explanation: Explanation) -> None:
     meshes = [builtin_objects()[name] for name in ("soup_can_red", "yellow_box", "banana")]
     surfaces = surfaces_of(meshes)
-    recognizer = Recognizer(dataclasses.replace(untrained_embedding_run(CLASSES), surfaces=surfaces))
+    recognizer = thor2.Recognizer(dataclasses.replace(untrained_embedding_run(CLASSES), surfaces=surfaces))
     recognizer.enroll("without a surface", [(FRAME, 7)])
     for own, mesh in zip(CLASSES, meshes, strict=True):
         points, colors = view_cloud(mesh, camera_pose(0.4, 1.1, mesh.centre))
@@ -319,12 +318,12 @@ def test_an_instance_is_compared_with_the_surfaces_of_objects(explanation: Expla
     assert yellow[0] > 0.9 > max(yellow[1:])
 
 
-def test_errors_name_the_argument(recognizer: Recognizer) -> None:
+def test_errors_name_the_argument(recognizer: thor2.Recognizer) -> None:
     for label, match in ((4, "^instance is 4; expected one of 3, 5, 7"), (5, "^instance 5 cannot be used: ")):
         assert_refused(match, explain, recognizer, FRAME, label)
-    assert_refused("no object", explain, Recognizer(untrained_run((), features=())), FRAME, 3)
+    assert_refused("no object", explain, thor2.Recognizer(untrained_run((), features=())), FRAME, 3)
     released = thor2.DescriptorConfig.released(n_slices=2, n_strips=5, image_size=8)
-    assert_refused("convention", explain, Recognizer(untrained_run(CLASSES, config=released)), FRAME, 3)
+    assert_refused("convention", explain, thor2.Recognizer(untrained_run(CLASSES, config=released)), FRAME, 3)
 
 
 def test_texts_of_pictures_are_inside(explanation: Explanation) -> None:

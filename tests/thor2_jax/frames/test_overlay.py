@@ -9,9 +9,8 @@ from PIL import Image, ImageDraw
 from refusals import assert_refused
 from scipy import ndimage
 
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+import thor2_jax as thor2
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, draw_overlay
-from thor2_jax.model.recognition import Recognition
 
 GREY = 90
 
@@ -29,15 +28,15 @@ def discs(centres: list[tuple[int, int]], radius: int, shape: tuple[int, int] = 
     return labels
 
 
-def named(label: int, name: str = "mug", occluded: bool = False) -> Recognition:
-    return Recognition(label=label, name=name, confidence=0.756, classifier="tops2", occluded=occluded)
+def named(label: int, name: str = "mug", occluded: bool = False) -> thor2.Recognition:
+    return thor2.Recognition(label=label, name=name, confidence=0.756, classifier="tops2", occluded=occluded)
 
 
-def frame_of(color: np.ndarray, labels: np.ndarray) -> RGBDFrame:
-    return RGBDFrame(color, np.zeros(labels.shape, np.uint16), labels, Intrinsics(1, 1, 0, 0))
+def frame_of(color: np.ndarray, labels: np.ndarray) -> thor2.RGBDFrame:
+    return thor2.RGBDFrame(color, np.zeros(labels.shape, np.uint16), labels, thor2.Intrinsics(1, 1, 0, 0))
 
 
-def drawn(color: np.ndarray, labels: np.ndarray, answers: list[Recognition], path: Path) -> np.ndarray:
+def drawn(color: np.ndarray, labels: np.ndarray, answers: list[thor2.Recognition], path: Path) -> np.ndarray:
     before = color.copy(), labels.copy()
     draw_overlay(frame_of(color, labels), answers, path)
     assert np.array_equal(color, before[0]) and np.array_equal(labels, before[1])
@@ -79,7 +78,7 @@ def outside(boxes: list[tuple[tuple[int, int, int, int], str]], shape: tuple[int
 def test_outlines_lie_on_the_inner_edge_of_touching_masks(tmp_path: Path, boxes: list) -> None:
     labels = discs([(250, 310), (300, 400)], 60)
     labels[300:320, 390:410] = 0  # holes have an outline too
-    answers = [named(1), Recognition(label=2, reason="too few points")]
+    answers = [named(1), thor2.Recognition(label=2, reason="too few points")]
     picture = drawn(photo(), labels, answers, tmp_path / "a.png")
     free = outside(boxes, labels.shape)
     for answer, paint in zip(answers, (COLORS[0], UNRECOGNIZED), strict=True):
@@ -97,11 +96,11 @@ def test_labels_are_complete_and_do_not_overlap(tmp_path: Path, boxes: list) -> 
     answers = {
         "1: mug 0.76\nTOPS2": named(1, "mug"),
         "2: bowl 0.76\nTOPS2, occluded": named(2, "bowl", occluded=True),
-        "3: unrecognized": Recognition(label=3, reason="too few points"),
-        "4: unrecognized\noccluded": Recognition(label=4, occluded=True, reason="too few points"),
-        "5: plate 1.00\nTOPS": Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
+        "3: unrecognized": thor2.Recognition(label=3, reason="too few points"),
+        "4: unrecognized\noccluded": thor2.Recognition(label=4, occluded=True, reason="too few points"),
+        "5: plate 1.00\nTOPS": thor2.Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
         "6: pitcher 0.76\nTOPS2": named(6, "pitcher"),
-        "7: spoon": Recognition(label=7, name="spoon"),
+        "7: spoon": thor2.Recognition(label=7, name="spoon"),
     }
     drawn(photo(), labels, list(answers.values()), tmp_path / "a.png")
     assert [text for _, text in boxes] == list(answers)
@@ -111,7 +110,7 @@ def test_labels_are_complete_and_do_not_overlap(tmp_path: Path, boxes: list) -> 
 
 def test_text_is_legible_on_its_box(tmp_path: Path, boxes: list) -> None:
     labels = discs([(100, 100), (100, 300), (100, 500), (350, 100), (350, 300), (350, 500)], 40)
-    answers = [*(named(k) for k in range(1, 6)), Recognition(label=6)]
+    answers = [*(named(k) for k in range(1, 6)), thor2.Recognition(label=6)]
     picture = drawn(photo(), labels, answers, tmp_path / "a.png")
     for (box, _), paint in zip(boxes, (*COLORS, UNRECOGNIZED), strict=True):
         inside = picture[box[1] : box[3] + 1, box[0] : box[2] + 1].reshape(-1, 3)
@@ -151,7 +150,7 @@ def test_sizes_scale_with_the_image(tmp_path: Path, boxes: list) -> None:
 def test_tiny_pictures_have_outlines_without_labels(tmp_path: Path, boxes: list) -> None:
     labels = np.zeros((8, 8), np.uint64)
     labels[1:7, 1:7], labels[7, 7] = 1, 2
-    picture = drawn(photo(8, 8), labels, [named(1), Recognition(label=2)], tmp_path / "a.png")
+    picture = drawn(photo(8, 8), labels, [named(1), thor2.Recognition(label=2)], tmp_path / "a.png")
     assert boxes == []
     assert (picture[1, 1:7] == COLORS[0]).all() and (picture[7, 7] == UNRECOGNIZED).all()
     assert (picture[3:5, 3:5] == GREY).all() and (picture[0] == GREY).all()
@@ -171,5 +170,5 @@ def test_answers_for_other_labels_are_refused(tmp_path: Path) -> None:
     [("Tasse ä", "Tasse ä"), ("\U0001f34e", r"\U0001f34e"), ("a\u202eb", r"a\u202eb"), ("\x1b", r"\x1b")],
 )
 def test_missing_characters_are_escaped(name: str, text: str, tmp_path: Path, boxes: list) -> None:
-    drawn(photo(), discs([(100, 40)], 20), [Recognition(label=1, name=name)], tmp_path / "a.png")
+    drawn(photo(), discs([(100, 40)], 20), [thor2.Recognition(label=1, name=name)], tmp_path / "a.png")
     assert boxes[0][1] == f"1: {text}"

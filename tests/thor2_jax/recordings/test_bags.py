@@ -15,7 +15,6 @@ from recording_files import COLOR, START, bag_writer, image, table_frame, write_
 from refusals import assert_refused
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RecordedFrame
 from thor2_jax.recordings import bags
 from thor2_jax.recordings.bags import Bag
@@ -121,7 +120,7 @@ def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
     try:
         for recorded in frames_of(path):
             recorded.read()
-    except InputError as error:
+    except thor2.InputError as error:
         assert str(path) in str(error)
     else:
         assert kept == 1, "a truncated recording was read without an error"

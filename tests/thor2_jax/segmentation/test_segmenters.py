@@ -10,17 +10,16 @@ import pytest
 from refusals import assert_refused
 
 import thor2_jax as thor2
-from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.segmentation import segmenters
 from thor2_jax.segmentation.segmenters import ENTRY_POINTS, load_segmenter, segment, segmenter_names
 from thor2_jax.segmentation.table import segment_table
 
-FRAME = RGBDFrame(
+FRAME = thor2.RGBDFrame(
     np.zeros((6, 8, 3), np.uint8), np.full((6, 8), 800, np.uint16), np.ones((6, 8), np.uint8), np.eye(3) * [50, 50, 1]
 )
 
 
-def halves(frame: RGBDFrame) -> np.ndarray[Any, Any]:
+def halves(frame: thor2.RGBDFrame) -> np.ndarray[Any, Any]:
     assert frame.labels is None
     labels = np.zeros(frame.depth.shape, np.uint16)
     labels[:, 4:] = 1
@@ -45,7 +44,7 @@ def test_the_table_segmenter_is_built_in() -> None:
 def test_a_segmenter_of_another_package(offer: Callable[[str, str], None]) -> None:
     offer("halves", "wrapper:halves")
     assert segmenter_names() == ["table", "halves"]
-    expected = halves(RGBDFrame(FRAME.color, FRAME.depth, None, FRAME.intrinsics))
+    expected = halves(thor2.RGBDFrame(FRAME.color, FRAME.depth, None, FRAME.intrinsics))
     for segmenter in ("halves", halves):
         np.testing.assert_array_equal(segment(FRAME, segmenter), expected)
         np.testing.assert_array_equal(thor2.segmented(FRAME, segmenter).label_image, expected)
@@ -77,7 +76,7 @@ def test_segmenters_that_fail() -> None:
     ):
         assert_refused(rf"^segmenter <lambda> returned {message}", segment, FRAME, lambda frame, result=result: result)
 
-    def failing(frame: RGBDFrame) -> np.ndarray[Any, Any]:
+    def failing(frame: thor2.RGBDFrame) -> np.ndarray[Any, Any]:
         raise NotImplementedError  # without a message
 
     assert_refused("^frame is of type str", segment, FRAME, lambda frame: segment_table(segment("frame")))

@@ -19,7 +19,6 @@ from processes import HANG
 from service_requests import calls, check_refused
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.decoding import MAX_BODY
@@ -221,7 +220,7 @@ def test_an_object_that_is_forgotten_meanwhile_is_not_enrolled(
 
 def test_a_list_at_the_end_of_a_message_has_three_dots() -> None:
     with pytest.raises(RequestError) as raised, field_errors():
-        raise InputError("instance is 7; expected one of 1, 2, ...")
+        raise thor2.InputError("instance is 7; expected one of 1, 2, ...")
     assert raised.value.message == "instance is 7; expected one of 1, 2, ..."
 
 

@@ -18,7 +18,6 @@ from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
-from thor2_jax.model.model import ColorTransform
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.service.answers import adaptation_answer, calibrated_confidence
 from thor2_jax.service.engine import InferenceEngine, recognize
@@ -100,7 +99,7 @@ def views(count: int) -> list[PreparedInstance]:
 
 
 def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -> Adaptation:
-    return Adaptation(ColorTransform(0.1, -0.1, 0.2, 0.05), len(instances), 1.0, 0.5)
+    return Adaptation(thor2.ColorTransform(0.1, -0.1, 0.2, 0.05), len(instances), 1.0, 0.5)
 
 
 @pytest.mark.parametrize("trained", [("a", "b"), ()])

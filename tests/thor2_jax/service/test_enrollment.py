@@ -24,7 +24,6 @@ from written_files import files_of
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import encode_image
 from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.service import pipeline
@@ -330,7 +329,7 @@ def test_the_client_teaches(http: httpx.Client, files: Files) -> None:
     generation = client.forget("client/tall ü")
     assert client.undo(generation) == generation + 1
     client.forget("client/tall ü")
-    with pytest.raises(InputError, match="name is None"):
+    with pytest.raises(thor2.InputError, match="name is None"):
         client.enroll(None, **files, instance=7)  # type: ignore[arg-type]
     for name in ("client/tall ü", None):  # None is the name of an unknown object
         with pytest.raises(ServiceError) as missing:

@@ -22,9 +22,7 @@ from small_clouds import CLOSED, NETWORK
 from small_runs import untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.inference import Inference
@@ -82,15 +80,15 @@ def test_explain_returns_the_answers_and_the_details_behind_them(
 
 def test_label_map_with_many_runs_is_subsampled(files: Files) -> None:
     labels = np.random.default_rng(0).integers(0, 3, (240, 320)).astype(np.uint8)  # 51,000 runs
-    label_map = prepare_frame(files | {"labels": encode_image(labels)}, DescriptorConfig(), True, None).label_map
+    label_map = prepare_frame(files | {"labels": encode_image(labels)}, thor2.DescriptorConfig(), True, None).label_map
     assert label_map is not None and len(label_map.labels) <= MAX_LABEL_RUNS
     np.testing.assert_array_equal(decoded(label_map), labels[::2, ::2])
     for shape in ((1, 1), (1, 3)):
         one = files | {name: encode_image(np.ones(shape, kind)) for name, kind in (("labels", "u1"), ("depth", "u2"))}
         one["color"] = encode_image(np.zeros((*shape, 3), np.uint8))
-        small = prepare_frame(one, DescriptorConfig(), True, None).label_map
+        small = prepare_frame(one, thor2.DescriptorConfig(), True, None).label_map
         assert small is not None and (small.labels, small.lengths) == ([1], [shape[1]])
-    assert prepare_frame(files, DescriptorConfig(), False, None).label_map is None
+    assert prepare_frame(files, thor2.DescriptorConfig(), False, None).label_map is None
 
 
 def explained(count: int, config: thor2.DescriptorConfig, z: np.ndarray, reason: str | None = None) -> Any:
@@ -142,11 +140,11 @@ def test_why_is_503_until_explanations_are_compiled(
     def compile_explanations(_: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
         assert is_compiled.wait(HANG) and not is_stopped()
         compiled.append((n_points, by_classifiers))
-        raise InputError("the error is left to requests, which compile what is missing")
+        raise thor2.InputError("the error is left to requests, which compile what is missing")
 
     monkeypatch.setattr(service, "_compiled", {})
     monkeypatch.setattr(pipeline, "compile_explanations", compile_explanations)
-    monkeypatch.setattr(pipeline, "explain_instance", Mock(side_effect=InputError("instance is explained")))
+    monkeypatch.setattr(pipeline, "explain_instance", Mock(side_effect=thor2.InputError("instance is explained")))
     for _ in range(2):
         response = ask(teaching_url, files)
         check_refused(response, 503, None, "compiled")

@@ -13,10 +13,8 @@ from image_files import write_frame
 from small_runs import with_surfaces
 from written_files import ParsedPage
 
-from thor2_jax.errors import InputError
-from thor2_jax.model.recognition import Recognition
+import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run, save_run
-from thor2_jax.recognizer import Recognizer
 from training.cli.app import option_arguments
 from training.frame_recognition import RecognizerArguments
 from training.reports import explanation_page
@@ -80,7 +78,7 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
 
 def test_names_without_enrolled_views_are_left_out() -> None:
     top = {"embedding": [("mug", 0.9), ("bowl", 0.1)], "gallery": [("mug", 1.0), ("bowl", 0.0)]}
-    answer = Recognition(1, "mug", 0.9, top=top)
+    answer = thor2.Recognition(1, "mug", 0.9, top=top)
     assert explanation_page._answer_table(answer)[1] == [["1", "mug 90.0 %", "mug >99.9 %"], ["2", "bowl 10.0 %", ""]]
 
 
@@ -112,16 +110,16 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     """The next command has an instance that was explained."""
     seen = []
 
-    def explain(recognizer: Recognizer, _: Any, label: int) -> SimpleNamespace:
+    def explain(recognizer: thor2.Recognizer, _: Any, label: int) -> SimpleNamespace:
         seen.append((recognizer.model.unknown_below, recognizer.model.answer_by, recognizer.objects.directory))
         if label == 4:
-            raise InputError("too few points")
+            raise thor2.InputError("too few points")
         return SimpleNamespace(title="mug " * 40)
 
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
     monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
     gallery = tmp_path / "gallery"
-    Recognizer.load(model, gallery=gallery).objects.add({})
+    thor2.Recognizer.load(model, gallery=gallery).objects.add({})
     given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
     text, progress = texts("explain", *given, frame, "--out", tmp_path / "out")
     assert "explain frame 1 of 1: 0 of 2, instance 1\n" in progress
