@@ -213,17 +213,12 @@ def module_patch() -> Iterator[pytest.MonkeyPatch]:
 
 
 @pytest.fixture(scope="module")
-def small_classifiers(module_patch: pytest.MonkeyPatch) -> Iterator[None]:
+def small_classifiers(module_patch: pytest.MonkeyPatch) -> None:
     """Let classifiers have two small hidden layers: a training and its checkpoints take a third of the time.
 
     Other processes have to be given the layers, since they do not see the change.
     """
-    import small_runs
-
     module_patch.setattr("thor2_jax.networks.networks.HIDDEN", (32, 16))
-    small_runs._drawn.cache_clear()
-    yield
-    small_runs._drawn.cache_clear()
 
 
 @pytest.fixture(scope="module")

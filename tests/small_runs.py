@@ -1,7 +1,6 @@
 """Runs and embeddings with random weights, which compile quickly, and what they answer."""
 
 import dataclasses
-import functools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,15 +54,9 @@ def save_trained_run(
     return save_untrained_run(folder, source.classes, ("tops",), config, record | {"temperatures": temperatures})
 
 
-@functools.cache
-def _drawn(n_inputs: int, n_classes: int, seed: int) -> MLP:
-    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(seed))
-
-
 def random_classifier(n_inputs: int, n_classes: int, seed: int) -> MLP:
     """Return a classifier with random weights."""
-    classifier: MLP = nnx.clone(_drawn(n_inputs, n_classes, seed))
-    return classifier
+    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(seed))
 
 
 def small_embedding(seed: int = 0) -> Embedding:
