@@ -1,6 +1,8 @@
-"""Files that commands write: the contents of a folder, leftovers of killed processes, and HTML pages."""
+"""Files that commands write: the contents of a folder, leftovers of killed processes, files of users, HTML pages."""
 
+import contextlib
 import shutil
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -11,6 +13,16 @@ def files_of(folder: Path) -> dict[str, bytes]:
     """Return the contents of all files of a folder but locks, by relative paths."""
     paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock")
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+@contextlib.contextmanager
+def files_of_the_user(*paths: Path) -> Iterator[None]:
+    """Write files that this software has not written, and assert at the end that they are there and unchanged."""
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("a user's")
+    yield
+    assert {path.read_text() for path in paths} == {"a user's"}
 
 
 def killed(directory: Path) -> Path:

@@ -14,7 +14,7 @@ import pytest
 from failures import small_disk
 from processes import HANG
 from refusals import assert_refused
-from written_files import killed
+from written_files import files_of_the_user, killed
 
 from thor2_jax import files
 
@@ -98,13 +98,11 @@ def test_a_directory_appears_when_it_is_complete(tmp_path: Path) -> None:
 def test_only_leftovers_of_this_software_are_removed(tmp_path: Path) -> None:
     own, similar, link = killed(tmp_path), tmp_path / ".thor2-abcdefgh", tmp_path / ".thor2-link"
     users = [tmp_path / ".vimrc.original", tmp_path / ".report.ab12_xyz.json", similar / "scan.ply", similar / ".thor2"]
-    similar.mkdir()
     link.symlink_to(killed(tmp_path.parent))
-    for path in users:
-        path.write_text("a user's")
-    files.remove_leftovers(tmp_path)
-    files.remove_leftovers(tmp_path / "missing")
-    assert all(path.read_text() == "a user's" for path in users) and (link / "half").exists() and not own.exists()
+    with files_of_the_user(*users):
+        files.remove_leftovers(tmp_path)
+        files.remove_leftovers(tmp_path / "missing")
+    assert (link / "half").exists() and not own.exists()
 
 
 def test_the_next_write_removes_what_a_killed_process_left(tmp_path: Path) -> None:

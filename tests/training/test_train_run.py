@@ -13,7 +13,7 @@ from failures import Interrupted, full_disk, stop_when
 from PIL import Image
 from refusals import assert_refused
 from small_clouds import brick_and_stick, random_clouds
-from written_files import files_of
+from written_files import files_of, files_of_the_user
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -192,12 +192,9 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     with pytest.raises(Interrupted):
         train(out, progress=stop_when("fit tops", 4))
     files = ("checkpoints/notes.txt", "weights/pretrained.npz", ".checkpoints/a", ".curves.12345678.png")
-    users = [out / name for name in files]
-    for path in users:
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("a user's")
-    train(out)
-    assert all(path.read_text() == "a user's" for path in users) and module.is_finished(out)
+    with files_of_the_user(*(out / name for name in files)):
+        train(out)
+    assert module.is_finished(out)
     assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
 
 

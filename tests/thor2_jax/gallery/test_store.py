@@ -17,7 +17,7 @@ import safetensors.numpy
 from processes import finish_programs, start_program
 from refusals import assert_refused
 from small_clouds import random_clouds
-from written_files import files_of, killed
+from written_files import files_of, files_of_the_user, killed
 
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
@@ -210,13 +210,9 @@ def test_files_and_links_of_the_user_stay_and_hinder_nothing(directory: Path, tm
     content_addressed = hashlib.sha256(b"a user's").hexdigest()
     names = [f"objects/{name}" for name in ("scan.ply", ".DS_Store", f"{content_addressed}.safetensors", "a/b.txt")]
     names += ["previous.json", ".index.backup12.json", ".vimrc.original", "notes.txt"]
-    users = [directory / name for name in names]
-    for path in users:
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("a user's")
-    for seed in (5, 6):
-        update_gallery(directory, add("mug", seed, replace=True), FINGERPRINT)
-    assert all(path.read_text() == "a user's" for path in users)
+    with files_of_the_user(*(directory / name for name in names)):
+        for seed in (5, 6):
+            update_gallery(directory, add("mug", seed, replace=True), FINGERPRINT)
     assert link.is_symlink() and (tmp_path / link.name).is_file()
     # Two objects, that of the change before, the user's file and the link.
     assert len(list((directory / "objects").glob("*.safetensors"))) == 2 + 1 + 1 + 1

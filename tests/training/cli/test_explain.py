@@ -11,7 +11,7 @@ from commands import Command, Texts, run_thor2
 from failures import full_disk
 from image_files import write_frame
 from small_runs import with_surfaces
-from written_files import ParsedPage
+from written_files import ParsedPage, files_of_the_user
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run, save_run
@@ -55,10 +55,6 @@ def test_a_page_for_every_instance(
 
 
 def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("1/scan.ply", "4/photo.png"):
-        (frame / name).parent.mkdir()
-        (frame / name).write_text("a user's")
-
     values = {"label": 1, "explained_name": "mug", "faithfulness": {}}
     explanation = SimpleNamespace(title="mug", as_json=lambda: values)
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", lambda *_: explanation)
@@ -66,14 +62,14 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
     for name, nothing in (("pictures", []), ("_lead", ""), ("_page_sections", [])):
         monkeypatch.setattr(explanation_page, name, lambda *_, nothing=nothing: nothing)
     command = ("explain", "--model", model, frame.parent, "--out", frame.parent, "--instance")
-    for _ in range(2):  # The second explanation replaces the first one.
-        assert run_thor2(*command, 1) == 0
-        names = sorted(path.name for path in (frame / "1").iterdir())
-        assert names == ["explanation.html", "explanation.json", "scan.ply"]
-    assert "photo.png" in refused(*command, 4)
-    other = write_frame(frame.parent / "other", {1: "book"})  # beside the pages of an earlier call
-    assert run_thor2("explain", "--model", model, other, "--out", frame.parent) == 0
-    assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
+    with files_of_the_user(frame / "1/scan.ply", frame / "4/photo.png"):
+        for _ in range(2):  # The second explanation replaces the first one.
+            assert run_thor2(*command, 1) == 0
+            names = sorted(path.name for path in (frame / "1").iterdir())
+            assert names == ["explanation.html", "explanation.json", "scan.ply"]
+        assert "photo.png" in refused(*command, 4)
+        other = write_frame(frame.parent / "other", {1: "book"})  # beside the pages of an earlier call
+        assert run_thor2("explain", "--model", model, other, "--out", frame.parent) == 0
 
 
 def test_names_without_enrolled_views_are_left_out() -> None:

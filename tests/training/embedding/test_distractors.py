@@ -13,6 +13,7 @@ from rendered_objects import write_box
 from scipy.sparse import csr_array
 from small_clouds import NETWORK
 from small_runs import SMALL_CONFIG
+from written_files import files_of_the_user
 
 import thor2_jax as thor2
 from training.embedding import distractors as module
@@ -72,17 +73,13 @@ def test_samples_are_built_once(
 
 
 def test_the_samples_used_last_are_kept_and_the_files_of_the_user(cache: Path, counted: Callable[..., int]) -> None:
-    cache.mkdir(parents=True)
-    users = [cache / "notes.txt", cache / f"distractors-{0:064}.safetensors"]
-    for path in users:
-        path.write_text("a user's")
-    for number in range(3):
-        assert counted(number) == 1
-    for path in stored(cache):
-        os.utime(path, (1, 1))
-    assert [counted(0), counted(3)] == [0, 1]
-    assert len(stored(cache)) == 3 and all(path.read_text() == "a user's" for path in users)
-    assert counted(0) == 0
+    with files_of_the_user(cache / "notes.txt", cache / f"distractors-{0:064}.safetensors"):
+        for number in range(3):
+            assert counted(number) == 1
+        for path in stored(cache):
+            os.utime(path, (1, 1))
+        assert [counted(0), counted(3)] == [0, 1]
+    assert len(stored(cache)) == 3 and counted(0) == 0
 
 
 def test_a_full_or_unwritable_disk_costs_one_warning(

@@ -16,6 +16,7 @@ from flax import nnx
 from refusals import assert_refused
 from small_clouds import NETWORK
 from small_runs import SMALL_CONFIG
+from written_files import files_of_the_user
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
@@ -176,9 +177,8 @@ def test_few_samples_and_invisible_objects(views: Samples, monkeypatch: pytest.M
 
 
 def test_a_file_of_the_user_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "embedding.safetensors").write_text("a user's")
-    assert_refused("embedding.safetensors", build_embedding, tmp_path / "embedding.safetensors")
-    assert (tmp_path / "embedding.safetensors").read_text() == "a user's"
+    with files_of_the_user(file := tmp_path / "embedding.safetensors"):
+        assert_refused("embedding.safetensors", build_embedding, file)
     (tmp_path / "new.checkpoints").touch()
     monkeypatch.setattr("sys.argv", ["build", "--out", str(tmp_path / "new")])
     with pytest.raises(SystemExit, match="^error: .*new.checkpoints"):

@@ -12,7 +12,7 @@ from PIL import Image
 from playwright.sync_api import Browser
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG
-from written_files import ParsedPage
+from written_files import ParsedPage, files_of_the_user
 
 import colornet
 from thor2_jax.figures import plain_text
@@ -76,9 +76,8 @@ def test_plots_draw_any_name(tmp_path: Path) -> None:
 
 
 def test_pictures_of_the_user_are_not_those_of_a_demo(tmp_path: Path) -> None:
-    (tmp_path / "pictures").mkdir()
-    (tmp_path / "pictures" / "scene-0.png").write_text("a user's")
-    assert_refused("already contains pictures", demo.run_demo, tmp_path)
+    with files_of_the_user(tmp_path / "pictures" / "scene-0.png"):
+        assert_refused("already contains pictures", demo.run_demo, tmp_path)
     assert [path.name for path in tmp_path.rglob("*.*")] == ["scene-0.png"]
 
 

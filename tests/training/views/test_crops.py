@@ -12,7 +12,7 @@ from commands import STEPS, run_thor2
 from refusals import assert_refused
 from rendered_objects import write_box
 from scipy.ndimage import generic_filter
-from written_files import files_of
+from written_files import files_of, files_of_the_user
 
 import thor2_jax as thor2
 from training.objects.meshes import find_meshes, load_mesh
@@ -176,11 +176,8 @@ def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, t
     assert_refused("has no crops.*--crops", plain.read_crops, 0, SIZE)
     training = TrainJob(tmp_path / "run", DEFAULT, dataset=plain.directory, baselines=["vit-cnn-small"])
     assert_refused("has no crops.*--crops", run_train_job, training, lambda *_: pytest.fail("work began"))
-    users = plain.directory / "crops" / "0000-0000.npz"
-    users.parent.mkdir()
-    users.write_text("a user's")
-    assert_refused("already contains", render_crops, job, plain, 8)
-    assert users.read_text() == "a user's"
+    with files_of_the_user(users := plain.directory / "crops" / "0000-0000.npz"):
+        assert_refused("already contains", render_crops, job, plain, 8)
     users.unlink()
     render_crops(job, plain, 8)
     manifest = plain.directory / "crops" / "manifest.json"

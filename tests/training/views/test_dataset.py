@@ -19,7 +19,7 @@ from failures import Interrupted
 from refusals import assert_refused
 from rendered_objects import write_box
 from small_clouds import CLOSED, random_clouds
-from written_files import files_of
+from written_files import files_of, files_of_the_user
 
 import thor2_jax
 from thor2_jax.errors import InputError
@@ -233,15 +233,12 @@ def views_of(clouds: list[Cloud]) -> NormalizedViews:
 
 
 def test_only_what_was_rendered_is_removed(copied: Path) -> None:
-    (copied / "crops").mkdir()
-    users = [copied / "notes.txt", copied / "crops" / "mine.npz"]
-    for path in users:
-        path.write_text("a user's")
-    remove_views(copied)
-    assert sorted(path for path in copied.rglob("*") if path.is_file()) == sorted(users[::-1])
-    (copied / "manifest.json").write_text("a user's")
-    remove_views(copied)
-    assert all(path.read_text() == "a user's" for path in (*users, copied / "manifest.json"))
+    users = [copied / "crops" / "mine.npz", copied / "notes.txt"]
+    with files_of_the_user(*users):
+        remove_views(copied)
+        assert sorted(path for path in copied.rglob("*") if path.is_file()) == users
+    with files_of_the_user(*users, copied / "manifest.json"):
+        remove_views(copied)
 
 
 def test_views_are_read_normalized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
