@@ -5,12 +5,13 @@ import io
 import json
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL.PngImagePlugin import putchunk
 
 import thor2_jax as thor2
 from thor2_jax.frames.frames import encode_image
@@ -27,15 +28,12 @@ def encode_npy(array: np.ndarray, **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def png_file(chunks: Sequence[tuple[bytes, bytes, int]]) -> bytes:
-    """Return a PNG file of chunks (kind, content, checksum), which may be invalid."""
-    packed = (struct.pack(">I", len(content)) + kind + content + struct.pack(">I", c) for kind, content, c in chunks)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
-
-
-def with_checksums(*chunks: tuple[bytes, bytes]) -> list[tuple[bytes, bytes, int]]:
-    """Return PNG chunks (kind, content) with their correct checksums."""
-    return [(kind, content, zlib.crc32(kind + content)) for kind, content in chunks]
+def png_file(*chunks: tuple[bytes, bytes]) -> bytes:
+    """Return a PNG file of chunks (kind, content), which may be invalid, with their correct checksums."""
+    stream = io.BytesIO()
+    for kind, content in chunks:
+        putchunk(stream, kind, content)
+    return b"\x89PNG\r\n\x1a\n" + stream.getvalue()
 
 
 def png_of_zeros(width: int, height: int, bits: int = 8) -> bytes:
@@ -45,7 +43,7 @@ def png_of_zeros(width: int, height: int, bits: int = 8) -> bytes:
     """
     header = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
     rows = zlib.compress(bytes(min((width * 3 * bits // 8 + 1) * height, 2**26)), 1)
-    return png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")))
+    return png_file((b"IHDR", header), (b"IDAT", rows), (b"IEND", b""))
 
 
 def write_frame_files(folder: Path, frame: thor2.RGBDFrame, names: Mapping[int, str] | None = None) -> Path:

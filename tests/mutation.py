@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cosmic_ray.ast import ast_nodes, get_ast
-from cosmic_ray.mutating import mutate_code
+from cosmic_ray.mutating import use_mutation
 from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -141,11 +141,8 @@ def time_limit(tree: Path, module: str) -> float:
 def run_mutant(tree: Path, mutant: Mutant) -> dict[str, Any]:
     """Test a mutant and return its record for the results file."""
     path, limit = tree / mutant.module, time_limit(tree, mutant.module)
-    source = (ROOT / mutant.module).read_text()
-    changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
-    path.write_text(changed)
-    outcome = test(tree, mutant.module, limit)
-    path.write_text(source)
+    with use_mutation(path, get_operator(mutant.operator)(), mutant.occurrence) as (source, changed):
+        outcome = test(tree, mutant.module, limit)
     diff = list(difflib.unified_diff(source.splitlines(), changed.splitlines(), n=0, lineterm=""))[3:]
     return {**mutant._asdict(), "outcome": outcome, "diff": diff}
 
