@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import pytest
+
 
 class Pickled:
     """Ends the process that unpickles it, with an exception that readers do not catch."""
@@ -19,14 +21,15 @@ class Interrupted(BaseException):
     """Like KeyboardInterrupt, not an Exception."""
 
 
-def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
-    """Return a display of progress that interrupts a training at a step of a stage."""
+def interrupt_at(stage: str, step: int, call: Callable[..., object], *arguments: Any) -> None:
+    """Call a training that shows its progress, and interrupt it at a step of a stage."""
 
     def progress(now: str, done: int, total: int, note: str) -> None:
         if (now, done) == (stage, step):
             raise Interrupted
 
-    return progress
+    with pytest.raises(Interrupted):
+        call(*arguments, progress=progress)
 
 
 def full_disk(*_: Any, **__: Any) -> None:

@@ -8,7 +8,7 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-from failures import Interrupted, stop_when
+from failures import Interrupted, interrupt_at
 from refusals import assert_refused
 from small_clouds import brick_and_stick
 from small_runs import SMALL_CONFIG
@@ -111,8 +111,7 @@ def test_an_interrupted_joint_fit_resumes(whole: Whole, tmp_path: Path, monkeypa
     sample = mock.Mock(wraps=distractors.sample_normalized)
     monkeypatch.setattr(distractors, "sample_normalized", sample)
     for stage, step in (("render distractors", 10), ("describe for the embedding", 8), ("fit networks", 2)):
-        with pytest.raises(Interrupted):
-            train(out, progress=stop_when(stage, step))
+        interrupt_at(stage, step, train, out)
         assert_refused(r"run\.json", load_run, out)
     with monkeypatch.context() as patch, pytest.raises(Interrupted):  # an epoch is logged and has no checkpoint yet
         patch.setattr(Checkpoints, "save", mock.Mock(side_effect=Interrupted))

@@ -9,7 +9,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from failures import Interrupted, full_disk, stop_when
+from failures import Interrupted, full_disk, interrupt_at
 from PIL import Image
 from refusals import assert_refused
 from small_clouds import brick_and_stick, random_clouds
@@ -118,8 +118,7 @@ def test_an_interrupted_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         train(out, ("tops", "ce"))
     assert len(logged_rows(out)) == 1
     for stage, step in (("fit ce", 2), ("fit ce", 8), ("fit tops", 9)):
-        with pytest.raises(Interrupted):
-            train(out, ("tops", "ce"), progress=stop_when(stage, step))
+        interrupt_at(stage, step, train, out, ("tops", "ce"))
         assert_refused(r"run\.json", load_run, out)
     run = train(out, ("tops", "ce"))
     same_weights(run, whole)
@@ -158,8 +157,7 @@ def test_failures_before_and_while_the_run_is_published(tmp_path: Path, monkeypa
 
 def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with pytest.raises(Interrupted):
-        train(out, progress=stop_when("fit tops", 4))
+    interrupt_at("fit tops", 4, train, out)
     before = files_of(out)
     begun = Protocol(("tops",), OPTIONS, CONFIG)
     for message, seed, changes in (
@@ -189,8 +187,7 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     (out / "checkpoints" / "epoch1.pt").write_text("a user's")
     assert_refused(r"already contains epoch1\.pt", train, out)
     (out / "checkpoints" / "epoch1.pt").rename(tmp_path / "epoch1.pt")
-    with pytest.raises(Interrupted):
-        train(out, progress=stop_when("fit tops", 4))
+    interrupt_at("fit tops", 4, train, out)
     files = ("checkpoints/notes.txt", "weights/pretrained.npz", ".checkpoints/a", ".curves.12345678.png")
     with files_of_the_user(*(out / name for name in files)):
         train(out)
@@ -217,8 +214,7 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             raise Interrupted
         rmdir(path, **options)
 
-    with pytest.raises(Interrupted):
-        run(stop_when("fold 1: fit tops", 4))
+    interrupt_at("fold 1: fit tops", 4, run)
     first = load_run(out / "fold-0")
     assert module.is_finished(out / "fold-0") and not module.is_finished(out)
     assert names(out) == ["checkpoints", "curves.png", "fold-0", "metrics.jsonl"]
@@ -280,7 +276,6 @@ def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
 
     def dies(stage: str, count: int, total: int, note: str) -> None:
         if stage == "describe" and not other.exists():
-            with pytest.raises(Interrupted):
-                train(other, progress=stop_when("fit tops", 3))
+            interrupt_at("fit tops", 3, train, other)
 
     assert train(other, progress=dies).record == done[0].record  # resumes the other training

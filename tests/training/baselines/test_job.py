@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from commands import Command
 from refusals import assert_refused
-from small_clouds import NETWORK, random_clouds
+from small_clouds import NETWORK, brick_and_stick
 from small_runs import random_classifier, save_trained_run
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.model.run_directory import load_run
-from thor2_jax.types import Cloud
 from training.baselines import job, thor
 from training.baselines.baseline import BaselineInputs, FitTask, StoredBaseline, baseline_file
 from training.baselines.cloud_baselines import load_forest
@@ -25,14 +24,7 @@ from training.views.normalized_views import MemoryViews, fold_of_views
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
-NAMES = ("plank", "cube")
-
-
-def clouds(seed: int = 0, views: int = 20) -> dict[str, list[Cloud]]:
-    return {
-        "plank": random_clouds(seed, [120] * views, (0.2, 0.03, 0.02), (200, 30, 30)),
-        "cube": random_clouds(seed, [120] * views, (0.06, 0.06, 0.06), (30, 30, 200)),
-    }
+NAMES = ("red brick", "stick")
 
 
 class Views(MemoryViews):
@@ -43,7 +35,7 @@ class Views(MemoryViews):
         return {**super().record, "job": {"azimuth_step": 90, "polar_step": 45}}
 
 
-SOURCE = Views(clouds(), CONFIG)
+SOURCE = Views(brick_and_stick(20), CONFIG)
 
 
 def write_run(folder: Path, folds: int = 2, fold: int = 1) -> Path:
@@ -69,7 +61,7 @@ def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeyp
     (run,) = load_runs([trained])
     assert run.predictors == ("tops", *names)
     assert set(run.temperatures) == {"tops", *names} and run.temperatures["tops"] == 1.5
-    packed = thor2.PointClouds.pack([cloud for each in clouds(5, 4).values() for cloud in each])
+    packed = thor2.PointClouds.pack([cloud for each in brick_and_stick(4, 5).values() for cloud in each])
     described: Any = SimpleNamespace(packed=packed, descriptors=describe(packed, NETWORK, CONFIG))
     inputs = BaselineInputs.of_frame(described, CONFIG, None)
     for name, baseline in run.baselines.items():
@@ -115,7 +107,7 @@ def test_each_view_type_has_every_class(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path, refused: Command) -> None:
-    assert_refused("^dataset: ", train_baselines, trained, Views(clouds(1), CONFIG), ["forest"])
+    assert_refused("^dataset: ", train_baselines, trained, Views(brick_and_stick(20, 1), CONFIG), ["forest"])
     assert check_baselines(["pointnet", "thor"], None, tmp_path) == ("thor", "pointnet")
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run", "--baselines", "forest, tree")
     assert refused(*command).startswith("error: --baselines is forest, tree; ")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run_thor2
-from failures import Interrupted, stop_when
+from failures import interrupt_at
 from PIL import Image
 from playwright.sync_api import Browser
 from refusals import assert_refused
@@ -95,8 +95,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
 
     for stage, step in (("stage 4 of 5: fit tops", 18), ("recognize scenes", 1)):
-        with pytest.raises(Interrupted):
-            demo.run_demo(tmp_path, 1, stop_when(stage, step))
+        interrupt_at(stage, step, demo.run_demo, tmp_path, 1)
     assert not (tmp_path / "report.html").exists()
     assert_refused("^out: .*seed 1, not 2", demo.run_demo, tmp_path, 2)
     stages: dict[str, tuple[int, int]] = {}
