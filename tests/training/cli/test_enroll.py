@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from commands import Command, Texts, frame_options, run_thor2
 from failures import full_disk
-from image_files import write_frame
-from PIL import Image
+from image_files import frame_of_squares, write_frame, write_frame_files
 from recording_files import table_frame, write_recording
 from refusals import assert_refused
 from rendered_objects import write_box
@@ -232,9 +231,7 @@ def test_a_gallery_elsewhere(model: Path, frames: Path, tmp_path: Path, printed:
 
 def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
     before, large = files_of(model), write_box(tmp_path / "mm.ply", (100, 200, 150))
-    tiny, mask = write_frame(tmp_path / "tiny", {1: "leaf"}), np.zeros((240, 320), np.uint8)
-    mask[10:13, 10:13] = 1
-    Image.fromarray(mask).save(tiny / "mask.png")
+    tiny = write_frame_files(tmp_path / "tiny", frame_of_squares({1: (10, 10, 0)}, 3), {1: "leaf"})
     assert "add views to it (--extend)" in refused("enroll", "--frames", frames, "--model", model)
     for given, words in (
         (("new", "--mesh", large), "mm.ply"),
