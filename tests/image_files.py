@@ -59,17 +59,6 @@ def write_frame_files(folder: Path, frame: thor2.RGBDFrame, names: Mapping[int, 
     return folder
 
 
-def small_frame(seed: int = 0) -> thor2.RGBDFrame:
-    """Return a frame of 120 x 90 pixels with the instances 1 and 4, in random colours."""
-    rng = np.random.default_rng(seed)
-    labels = np.zeros((90, 120), np.uint8)
-    labels[10:50, 10:50], labels[30:75, 60:105] = 1, 4
-    depth = np.full(labels.shape, 900, np.uint16)
-    depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
-    color = rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)
-    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(120.0, 120.0, 60.0, 45.0))
-
-
 def frame_of_squares(
     squares: Mapping[int, tuple[int, int, ArrayLike]], side: int = 40, shape: tuple[int, int] = (120, 160)
 ) -> thor2.RGBDFrame:
@@ -80,6 +69,12 @@ def frame_of_squares(
         here = slice(row, row + side), slice(column, column + side)
         color[here], labels[here], depth[here] = rgb, label, 700
     return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 79.5, 59.5))
+
+
+def small_frame(seed: int = 0) -> thor2.RGBDFrame:
+    """Return a frame of 120 x 90 pixels with the instances 1 and 4, in random colours."""
+    first, second = np.random.default_rng(seed).integers(0, 256, (2, 40, 40, 3))
+    return frame_of_squares({1: (10, 10, first), 4: (30, 60, second)}, shape=(90, 120))
 
 
 def patches() -> NDArray[np.uint8]:
