@@ -1,7 +1,6 @@
 """Damaged datasets, run directories and colour networks."""
 
 import dataclasses
-import hashlib
 import io
 import json
 import zipfile
@@ -20,9 +19,10 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.testing import damaged
+from training.objects.builtin_objects import builtin_objects
 from training.storage.jobs import MANIFEST
-from training.views.dataset import Shard, ViewDataset, encode
-from training.views.normalized_views import NormalizedViews
+from training.views.dataset import ViewDataset, render_dataset
+from training.views.mesh_views import RenderJob
 
 from .conftest import other_content
 
@@ -49,15 +49,7 @@ def test_datasets(data: st.DataObject, dataset: tuple[Any, list[Path]], attempt:
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("views")
-    rng = np.random.default_rng(0)
-    xyz = rng.integers(0, 2**14, (12, 3)).astype(np.float32) / 2**14
-    rgb = rng.integers(0, 256, (12, 3), dtype=np.uint8)
-    numbers = np.arange(2, dtype=np.int32), np.zeros(2, np.int32)
-    content = encode(NormalizedViews(xyz, rgb, np.array([5, 7]), 0, *numbers, xyz[:2]))
-    (path / "0000-0000.safetensors").write_bytes(content)
-    shard = Shard("0000-0000.safetensors", hashlib.sha256(content).hexdigest(), 0, 2, 0, 12)
-    job = {"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}
-    (path / MANIFEST).write_text(ViewDataset(path, job, (shard,)).manifest)
+    render_dataset(RenderJob({"ball": builtin_objects()["tennis_ball"]}, 360, 180), path)
     return path
 
 
