@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import json_lines
-from image_files import small_frame, write_frame_files
+from image_files import frame_of_squares, small_frame, write_frame_files
 from PIL import Image
 from refusals import assert_refused
 from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
@@ -43,16 +43,12 @@ class Frames(LabelledFrames):
 
 def toy_frames(n: int, prefix: str = "frame") -> Frames:
     """Frames with labels 1 to 3, whose first pixel is the frame number; 3 is unknown, 2 is missing in every fourth."""
-    rows, columns = np.indices((48, 64))  # curved, since a plane has several boxes of equal size
-    depth, frames = (800 + rows * rows // 40 + columns * columns // 60).astype(np.uint16), []
+    frames = []
     for number in range(n):
-        color = np.random.default_rng(number).integers(0, 255, (48, 64, 3), dtype=np.uint8)
-        color[0, 0] = number
-        labels = np.zeros((48, 64), np.uint8)
-        labels[5:20, 5:25] = 1
-        labels[25:40, 20:60] = 2 if number % 4 else 0
-        labels[2:9, 40:60] = 3
-        frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(50.0, 50.0, 32.0, 24.0))
+        first, second, third = np.random.default_rng(number).integers(0, 256, (3, 20, 20, 3))
+        squares = {1: (5, 5, first), 3: (2, 40, third)} | ({2: (25, 30, second)} if number % 4 else {})
+        frame = frame_of_squares(squares, side=20, shape=(48, 64))
+        frame.color[0, 0] = number
         truth = {1: CLASSES[number % 3], 2: "mug", 3: "dragon"}
         frames.append(LabelledFrame(f"{prefix}{number}", frame, truth, {"light": str(number % 2)}))
     return Frames(frames)
