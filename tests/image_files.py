@@ -77,14 +77,19 @@ def small_frame(seed: int = 0) -> thor2.RGBDFrame:
     return frame_of_squares({1: (10, 10, first), 4: (30, 60, second)}, shape=(90, 120))
 
 
+def label_image(
+    *rectangles: tuple[int, int, int, int, int], shape: tuple[int, int] = (240, 320), dtype: Any = np.uint8
+) -> NDArray[Any]:
+    """Return labels; each rectangle is (label, first row, end row, first column, end column)."""
+    labels = np.zeros(shape, dtype)
+    for label, top, bottom, left, right in rectangles:
+        labels[top:bottom, left:right] = label
+    return labels
+
+
 def patches() -> NDArray[np.uint8]:
     """Return label images of three usable instances and one that is too small."""
-    labels = np.zeros((240, 320), np.uint8)
-    labels[20:100, 20:90] = 3
-    labels[200:203, 10:13] = 5
-    labels[20:60, 150:250] = 7
-    labels[120:220, 100:150] = 200
-    return labels
+    return label_image((3, 20, 100, 20, 90), (5, 200, 203, 10, 13), (7, 20, 60, 150, 250), (200, 120, 220, 100, 150))
 
 
 def tilted(labels: np.ndarray) -> thor2.RGBDFrame:

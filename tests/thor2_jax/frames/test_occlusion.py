@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from image_files import instance_clouds
+from image_files import instance_clouds, label_image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 
@@ -21,9 +21,7 @@ def occlusions(depth: np.ndarray, labels: np.ndarray) -> dict[int, tuple[bool, n
 
 def scene(back: int = 800, front: int = 700, table: int = 1000) -> tuple[np.ndarray, np.ndarray]:
     """Return depth in millimetres and labels of two adjacent blocks, at columns 30 to 79 and 80 to 129."""
-    labels = np.zeros((120, 160), np.uint8)
-    labels[30:90, 30:80] = BACK
-    labels[40:100, 80:130] = FRONT
+    labels = label_image((BACK, 30, 90, 30, 80), (FRONT, 40, 100, 80, 130), shape=(120, 160))
     return np.choose(labels, [table, back, front]).astype(np.uint16), labels
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from image_files import instance_clouds
+from image_files import instance_clouds, label_image
 from refusals import assert_refused
 from scipy import ndimage
 from scipy.spatial import KDTree
@@ -29,14 +29,6 @@ def flat(millimetres: int = 800) -> np.ndarray:
     return np.full((HEIGHT, WIDTH), millimetres, np.uint16)
 
 
-def patch(*rectangles: tuple[int, int, int, int, int]) -> np.ndarray:
-    """Return labels; each rectangle is (label, first row, end row, first column, end column)."""
-    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
-    for label, top, bottom, left, right in rectangles:
-        labels[top:bottom, left:right] = label
-    return labels
-
-
 def only(frame: RGBDFrame) -> PreparedInstance:
     (cloud,) = instance_clouds(frame)
     return cloud
@@ -46,7 +38,7 @@ def only(frame: RGBDFrame) -> PreparedInstance:
 
 
 def test_intrinsics_with_which_points_are_too_far_apart() -> None:
-    frame = frame_of(flat(), patch((1, 20, 60, 30, 90)))
+    frame = frame_of(flat(), label_image((1, 20, 60, 30, 90)))
     absurd = dataclasses.replace(frame, intrinsics=Intrinsics(1e-6, 1e-6, 0, 0))
     assert_refused("^intrinsics place the points of an instance too far apart", instance_clouds, absurd)
     assert_refused("^instance is 99; expected one of 1$", prepare_instance, frame, 99, 2.5)
@@ -57,7 +49,7 @@ def test_colors_stay_with_their_points() -> None:
 
     Green is the row, and red is half the column.
     """
-    labels, color = patch((1, 20, 26, 60, 66), (1, 50, 110, 60, 150)), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    labels, color = label_image((1, 20, 26, 60, 66), (1, 50, 110, 60, 150)), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     color[..., 0] = np.arange(WIDTH) // 2
     color[..., 1] = np.arange(HEIGHT)[:, None]
     depth = flat()
@@ -70,7 +62,7 @@ def test_colors_stay_with_their_points() -> None:
 
 @pytest.mark.parametrize("window", [(60, 140, 70, 200), (0, 80, 0, 90), (160, 240, 200, 320), (0, 240, 0, 320)])
 def test_the_rim_is_what_an_erosion_of_the_mask_removes(window: tuple[int, int, int, int]) -> None:
-    labels = patch((3, *window))
+    labels = label_image((3, *window))
     top, bottom, left, right = window
     labels[(top + bottom) // 2 - 6 : (top + bottom) // 2, (left + right) // 2 :] = 0  # a notch
     labels[top + 20 : top + 30, left + 20 : left + 30] = 9  # an object in front of it
@@ -87,7 +79,7 @@ def test_the_rim_is_what_an_erosion_of_the_mask_removes(window: tuple[int, int, 
 
 @pytest.mark.parametrize(("width", "has_rim"), [(100, True), (6, False)])
 def test_prepared_instances_have_a_rim_unless_they_are_narrow(width: int, has_rim: bool) -> None:
-    frame = frame_of(flat(), patch((1, 100, 200, 50, 50 + width)))
+    frame = frame_of(flat(), label_image((1, 100, 200, 50, 50 + width)))
     prepared = prepare_instance(frame, 1, 2.5)
     assert prepared.reason is None and prepared.rim is not None and bool(prepared.rim.any()) == has_rim
     packed = pack_instances([prepared], 2)
@@ -97,7 +89,7 @@ def test_prepared_instances_have_a_rim_unless_they_are_narrow(width: int, has_ri
 
 @pytest.mark.parametrize(("millimetres", "used"), [(0, False), (259, False), (260, True), (2500, True), (2501, False)])
 def test_valid_depth(millimetres: int, used: bool) -> None:
-    frame = frame_of(flat(millimetres), patch((4, 20, 220, 20, 300)))
+    frame = frame_of(flat(millimetres), label_image((4, 20, 220, 20, 300)))
     cloud = only(frame)
     assert cloud.label == 4
     assert (cloud.reason is None) == used and (len(cloud.points) > 1000) == used
@@ -117,7 +109,7 @@ def test_valid_depth(millimetres: int, used: bool) -> None:
 )
 def test_minimum_number_of_points(distance: int, size: tuple[int, int], points: int | None) -> None:
     """At a distance of 2.25 m, pixels are 3.75 mm apart, one in each voxel."""
-    cloud = only(frame_of(flat(distance), patch((1, 5, 5 + size[0], 10, 10 + size[1]))))
+    cloud = only(frame_of(flat(distance), label_image((1, 5, 5 + size[0], 10, 10 + size[1]))))
     assert (cloud.reason is None) == (points is None)
     if points is not None:
         assert f"{points} points" in str(cloud.reason) and "at least 30" in str(cloud.reason)
@@ -159,7 +151,7 @@ def test_every_point_of_a_box_is_kept(seed: int) -> None:
 @pytest.mark.parametrize(("width", "fallback"), [(2, True), (4, False), (5, False), (8, False)])
 def test_a_flat_strip_is_kept(width: int, fallback: bool) -> None:
     """The strip is 0.26 m long and 3 mm to 1 cm wide; narrow ones may lose 1 cm at either end."""
-    labels = patch((1, 20, 220, 100, 100 + width))
+    labels = label_image((1, 20, 220, 100, 100 + width))
     cloud = only(frame_of(flat(800), labels))
     assert cloud.reason is None and cloud.kept_by_fallback == fallback
     assert np.ptp(cloud.points[:, 1]) > 199 * 0.8 / CAMERA.fy - (0.022 if width == 4 else 0.003)
@@ -170,7 +162,8 @@ def test_a_flat_strip_is_kept(width: int, fallback: bool) -> None:
 def test_a_mask_that_extends_beyond_its_plane(reach: int, wall: float) -> None:
     """The mask includes a border of flying pixels and the wall behind; only the plane is kept, with its corners."""
     rng = np.random.default_rng(reach)
-    plane, labels = patch((1, 60, 180, 80, 240)) == 1, patch((1, 60 - reach, 180 + reach, 80 - reach, 240 + reach))
+    plane = label_image((1, 60, 180, 80, 240)) == 1
+    labels = label_image((1, 60 - reach, 180 + reach, 80 - reach, 240 + reach))
     edge = ndimage.binary_dilation(plane, np.ones((3, 3))) & ~plane
     depth = np.where(plane, 0.8, wall)
     depth[edge] = rng.uniform(0.83, max(wall, 1.0), int(edge.sum()))
@@ -181,7 +174,7 @@ def test_a_mask_that_extends_beyond_its_plane(reach: int, wall: float) -> None:
 
 def test_a_strip_of_the_table_beside_an_object_is_dropped() -> None:
     """The strip is six pixels wide, begins at the foot of the object and ends 24 cm behind it."""
-    labels = patch((1, 60, 180, 100, 196))
+    labels = label_image((1, 60, 180, 100, 196))
     depth = np.full((HEIGHT, WIDTH), 0.8) + np.maximum(180 - np.arange(HEIGHT)[:, None], 0) * 0.002
     depth[:, :190] = 0.8
     cloud = only(frame_of(depth, labels))
@@ -191,7 +184,7 @@ def test_a_strip_of_the_table_beside_an_object_is_dropped() -> None:
 
 def test_a_rule_that_is_skipped_leaves_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
     module = "thor2_jax.frames.prepared_instance."
-    frame = frame_of(flat(800), patch((1, 60, 180, 100, 260)))
+    frame = frame_of(flat(800), label_image((1, 60, 180, 100, 260)))
     monkeypatch.setattr(module + "flying_pixels", lambda _, pixels: np.arange(len(pixels)) < len(pixels) // 4)
     expected = only(frame)
     monkeypatch.setattr(module + "strip_pixels", lambda _, pixels, rim: np.ones(len(pixels), bool))
@@ -201,8 +194,8 @@ def test_a_rule_that_is_skipped_leaves_the_other(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_bottom_of_a_cup_is_kept() -> None:
-    labels = patch((1, 60, 180, 100, 220))
-    inside = patch((1, 64, 176, 104, 216)) == 1
+    labels = label_image((1, 60, 180, 100, 220))
+    inside = label_image((1, 64, 176, 104, 216)) == 1
     depth = np.where(inside, 0.9, 0.8)
     cloud = only(frame_of(depth, labels))
     flying = inside & ~ndimage.binary_erosion(inside)
@@ -212,7 +205,7 @@ def test_the_bottom_of_a_cup_is_kept() -> None:
 @pytest.mark.parametrize(("deep", "flagged"), [(7, False), (8, False), (9, True)])
 def test_fallback_if_more_than_half_are_flying_pixels(deep: int, flagged: bool) -> None:
     """`deep` of 16 columns are flying pixels behind the teeth of a comb."""
-    depth, labels = np.full((HEIGHT, WIDTH), 0.8), patch((1, 60, 180, 100, 260))
+    depth, labels = np.full((HEIGHT, WIDTH), 0.8), label_image((1, 60, 180, 100, 260))
     behind = (np.arange(WIDTH) - 100) % 16
     teeth = {7: (1, 3, 5, 7, 9, 11, 13), 8: (1, 3, 5, 7, 9, 10, 12, 13), 9: (1, 2, 4, 5, 7, 8, 10, 11, 13)}[deep]
     depth[:, np.isin(behind, teeth)] = 0.84
@@ -237,7 +230,7 @@ def test_real_frames_have_a_cloud_for_every_object(shared: Path) -> None:
 
 def test_around_an_instance_are_the_points_of_other_pixels() -> None:
     """The box of an instance is enlarged by a quarter; the mask counts two pixels more on each side."""
-    labels, depth = patch((1, 100, 140, 100, 180), (2, 100, 140, 190, 200)), flat(1000)
+    labels, depth = label_image((1, 100, 140, 100, 180), (2, 100, 140, 190, 200)), flat(1000)
     depth[labels == 1], depth[:, 190:200], depth[:90] = 800, 850, 0
     frame = frame_of(depth, labels)
     instance = prepare_instance(frame, 1, 2.5)
@@ -266,7 +259,7 @@ def test_around_an_instance_behind_a_distorting_lens() -> None:
     """The depth grows by 1 mm with each column, in which OpenCV projects the point."""
     camera = dataclasses.replace(CAMERA, distortion=(0.8, -0.5, 0.01, 0.02, 0.0))
     depth = (1000 + np.arange(WIDTH)).astype(np.uint16) + flat(0)
-    frame = RGBDFrame(NOISE, depth, patch((1, 190, 220, 250, 300)), camera)
+    frame = RGBDFrame(NOISE, depth, label_image((1, 190, 220, 250, 300)), camera)
     around = prepare_instance(frame, 1, 2.5).around
     rays = np.dstack([around[..., :2], np.ones(around.shape[:2])]).reshape(-1, 3)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
@@ -278,7 +271,7 @@ def test_around_an_instance_behind_a_distorting_lens() -> None:
 
 def test_around_at_the_image_border() -> None:
     """Pixels within the width of the rim of the border are left out; only trusted depth is kept."""
-    labels, depth = patch((1, 0, 60, 0, 60), (2, 200, 240, 260, 320)), flat(1000)
+    labels, depth = label_image((1, 0, 60, 0, 60), (2, 200, 240, 260, 320)), flat(1000)
     depth[:, 62:66], depth[63:66] = 200, 10100
     for label, x, y in ((1, (2, 77), (2, 77)), (2, (242, 317), (187, 237))):
         around = prepare_instance(frame_of(depth, labels), label, 2.5).around

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from image_files import label_image
 from segmentation_scenes import APART, CAMERA, TABLE_TOP, Box, best_overlaps, camera_pose, cast, render, surface
 from slow_tier import slow
 
@@ -209,8 +210,7 @@ def test_images_of_few_pixels(size: tuple[int, int]) -> None:
 def test_borders_are_refined_as_in_the_whole_image() -> None:
     """Only the part of the image around the pieces is flooded; a far piece makes it the whole image."""
     color = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
-    labels = np.zeros((48, 64), np.int32)
-    labels[20:30, 12:30] = 1
+    labels = label_image((1, 20, 30, 12, 30), shape=(48, 64), dtype=np.int32)
     alone = _refined(labels, color, 2)
     labels[0:4, 0:4], labels[44:48, 60:64] = 2, 3
     np.testing.assert_array_equal(alone == 1, _refined(labels, color, 2) == 1)
@@ -227,13 +227,7 @@ def test_small_holes_in_a_thing_are_filled(hole: int, is_filled: bool) -> None:
 
 
 def test_the_rim_of_thick_things_is_trimmed() -> None:
-    labels = np.zeros((80, 120), np.int32)
-    labels[5:65, 10:70] = 1
-    labels[5:65, 70:110] = 257  # beside it
-    labels[70:73, 10:110] = 3  # thin
-    trimmed = _trimmed(labels, 3)
-    expected = np.zeros_like(labels)
-    expected[6:64, 11:69] = 1
-    expected[6:64, 71:109] = 257
-    expected[70:73, 10:110] = 3
-    np.testing.assert_array_equal(trimmed, expected)
+    thin, thick = (3, 70, 73, 10, 110), [(1, 5, 65, 10, 70), (257, 5, 65, 70, 110)]
+    inner = [(label, top + 1, bottom - 1, left + 1, right - 1) for label, top, bottom, left, right in thick]
+    labels, expected = (label_image(thin, *each, shape=(80, 120), dtype=np.int32) for each in (thick, inner))
+    np.testing.assert_array_equal(_trimmed(labels, 3), expected)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from image_files import label_image
 from page_actions import RECORD_TEXTS, assert_fits, changed_answers, pixels, upload
 from playwright.sync_api import Page, expect
 
@@ -72,10 +73,8 @@ def test_tags_neither_overlap_nor_hide_small_objects(open_page: Open, files: Fil
         expect(chosen).to_have_attribute("data-label", label)
         expect(chosen.locator(".swatch")).to_have_text(label)
 
-    labels = np.zeros((240, 320), np.uint8)
     places = {1: (20, 20), 2: (20, 150), 3: (100, 60), 4: (100, 230), 5: (180, 150)}
-    for small, (y, x) in places.items():
-        labels[y : y + 16, x : x + 20] = small
+    labels = label_image(*((small, y, y + 16, x, x + 20) for small, (y, x) in places.items()))
     page.unroute("**/v1/**")
     upload(page, files | {"labels": encode_image(labels)})
     expect(page.locator("#objects button")).to_have_count(5)

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from image_files import label_image
 from scipy.ndimage import binary_dilation, binary_erosion
 
 import thor2_jax as thor2
@@ -13,6 +14,7 @@ from training.rendering.camera import axial_deviation
 
 INTRINSICS = thor2.Intrinsics(100.0, 100.0, 40.0, 30.0)
 SQUARE = np.ones((3, 3), bool)
+MASKS = label_image((1, 10, 40, 10, 30), (7, 20, 50, 30, 60), (9, 55, 57, 70, 72), shape=(60, 80))
 
 
 def make_frame(depth: np.ndarray | None = None, labels: np.ndarray | None = None) -> thor2.RGBDFrame:
@@ -21,17 +23,9 @@ def make_frame(depth: np.ndarray | None = None, labels: np.ndarray | None = None
     return thor2.RGBDFrame(color, depth, labels, INTRINSICS)
 
 
-def two_masks() -> np.ndarray:
-    labels = np.zeros((60, 80), np.uint8)
-    labels[10:40, 10:30] = 1
-    labels[20:50, 30:60] = 7
-    labels[55:57, 70:72] = 9
-    return labels
-
-
 def test_a_camera_is_deterministic_and_leaves_its_frame() -> None:
     depth = np.random.default_rng(1).integers(0, 2, (60, 80)).astype(np.uint16) * 900
-    frame = make_frame(depth, two_masks())
+    frame = make_frame(depth, MASKS)
     before = copy.deepcopy(frame)
     first, second = (through_camera(frame, REPORT[-1]) for _ in range(2))
     other = through_camera(frame, dataclasses.replace(REPORT[-1], name="another"))
@@ -99,17 +93,16 @@ def test_holes_have_no_depth() -> None:
 @pytest.mark.parametrize("pixels", [1, 3])
 def test_masks_are_eroded_and_dilated_like_morphology(pixels: int) -> None:
     """Masks do not grow into each other; the mask of four pixels would disappear and stays."""
-    labels = two_masks()
-    frame = make_frame(labels=labels)
+    frame = make_frame(labels=MASKS)
     eroded = through_camera(frame, SimulatedCamera("c", mask=-pixels)).labels
     dilated = through_camera(frame, SimulatedCamera("c", mask=pixels)).labels
     for label in (1, 7):
-        expected = binary_erosion(labels == label, SQUARE, iterations=pixels)
+        expected = binary_erosion(MASKS == label, SQUARE, iterations=pixels)
         np.testing.assert_array_equal(eroded == label, expected)
-        grown = binary_dilation(labels == label, SQUARE, iterations=pixels)
-        assert ((dilated == label) <= grown).all() and (dilated[labels == label] == label).all()
+        grown = binary_dilation(MASKS == label, SQUARE, iterations=pixels)
+        assert ((dilated == label) <= grown).all() and (dilated[MASKS == label] == label).all()
     assert (eroded == 9).sum() == 4
-    np.testing.assert_array_equal(dilated > 0, binary_dilation(labels > 0, SQUARE, iterations=pixels))
+    np.testing.assert_array_equal(dilated > 0, binary_dilation(MASKS > 0, SQUARE, iterations=pixels))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5])
@@ -119,18 +112,15 @@ def test_masks_lack_what_is_near_the_table(tilt: float) -> None:
     ray = np.stack([(column - 40) / 100, (row - 30) / 100, np.ones((60, 80))], axis=-1)
     normal = np.array([0, -np.sin(tilt), -np.cos(tilt)])
     height = np.zeros((60, 80))
-    labels = np.zeros((60, 80), np.uint8)
-    labels[20:40, 20:40] = 1
     height[20:40, 20:40] = 0.1
     height[34:40, 20:40] = 0.006
-    labels[20:40, 60:70] = 2
     height[20:40, 60:70] = 0.006
     height[:, 42:58] = np.random.default_rng(0).uniform(0.05, 0.2, (60, 16))  # half of the surroundings is no table
     depth = (height - np.cos(tilt)) / (ray @ normal)
+    labels = label_image((1, 20, 40, 20, 40), (2, 20, 40, 60, 70), shape=(60, 80))
     frame = make_frame(depth.astype(np.float32), labels)
     seen = through_camera(frame, SimulatedCamera("c", mask=-1, base=0.01)).labels
-    expected = np.zeros_like(labels)
-    expected[21:34, 21:39], expected[21:39, 61:69] = 1, 2
+    expected = label_image((1, 21, 34, 21, 39), (2, 21, 39, 61, 69), shape=(60, 80))
     np.testing.assert_array_equal(seen, expected)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import json_lines
-from image_files import frame_of_squares, small_frame, write_frame_files
+from image_files import frame_of_squares, label_image, small_frame, write_frame_files
 from PIL import Image
 from refusals import assert_refused
 from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
@@ -197,9 +197,8 @@ def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
 def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:
     from training.evaluation.frame_pictures import CORRECT, INCORRECT, draw_crop, draw_judged
 
-    color, labels = np.full((60, 90, 3), 128, np.uint8), np.zeros((60, 90), np.uint8)
-    labels[20:50, 5:40] = 1
-    labels[20:50, 50:85] = 2
+    color = np.full((60, 90, 3), 128, np.uint8)
+    labels = label_image((1, 20, 50, 5, 40), (2, 20, 50, 50, 85), shape=(60, 90))
     judged = [Annotation(2, INCORRECT, "b (c)"), Annotation(7, INCORRECT, "gone"), Annotation(1, CORRECT, "a")]
     draw_judged(color, labels, judged, tmp_path / "f.jpg")
     pixels = np.asarray(Image.open(tmp_path / "f.jpg").convert("RGB")).astype(int)
