@@ -1,7 +1,6 @@
 """Small datasets that tests write in the layouts of BOP, OCID, UW-IS Occluded and of folders of frames."""
 
 import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -100,14 +99,11 @@ def pack_pcd(points: np.ndarray, color: np.ndarray, labels: np.ndarray, data: st
         f"TYPE F F F U U\nCOUNT 1 1 1 1 1\nWIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\n"
         f"POINTS {width * height}\nDATA {data}\n"
     ).encode()
-    rows = []
-    colors, of_points = color.reshape(-1, 3).tolist(), labels.ravel().tolist()
-    for xyz, (red, green, blue), label in zip(points.reshape(-1, 3), colors, of_points, strict=True):
-        rgba = 0xFF000000 | red << 16 | green << 8 | blue
-        values = (*xyz.tolist(), rgba, max(label - 1, 0))
-        ascii_row = "{:.9g} {:.9g} {:.9g} {} {}\n".format(*values).encode()
-        rows.append(ascii_row if data == "ascii" else struct.pack("<fffII", *values))
-    return header + b"".join(rows)
+    rgba = 0xFF000000 + color.reshape(-1, 3) @ [1 << 16, 1 << 8, 1]
+    columns = [*points.reshape(-1, 3).T, rgba, np.maximum(labels.ravel(), 1) - 1]
+    rows = np.rec.fromarrays(columns, formats="<f4,<f4,<f4,<u4,<u4")
+    in_text = "".join("{:.9g} {:.9g} {:.9g} {} {}\n".format(*row) for row in rows.tolist())
+    return header + (in_text.encode() if data == "ascii" else rows.tobytes())
 
 
 def write_ocid(root: Path, sequence: str = "table/bottom/curved/seq36", stem: str = STEM, **options: Any) -> Path:
