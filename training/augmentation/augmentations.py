@@ -8,7 +8,7 @@ removes pixels along the outline; the base removes the lowest pixels; occlusion 
 the sensor perturbs or removes depth. Where pixels are added or removed, colour and depth change together. The view as
 rendered is always kept as copy 0.
 
-This module has the augmentations of the pixels that are taken for an object, and `sensing` those of its images:
+The augmentations of light, registration and noise are in `sensing`. Those of the mask are here:
 
 - A view is occluded by the outline of a built-in object or a straight edge.
 - A mask is too small or too large by some pixels, so that points are missing or from the background. The background is
