@@ -134,6 +134,9 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
     def _pair(self, cloud: Any, name: str) -> Any:
         return cloud
 
+    def __sklearn_is_fitted__(self) -> bool:
+        return True
+
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
         tags.requires_fit = False
