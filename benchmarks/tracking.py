@@ -105,7 +105,7 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
 
 
 def probabilities_of(recognizer: Recognizer, instances: Sequence[PreparedInstance]) -> list[dict[str, Any]]:
-    """Return classifier -> class probabilities [C] for each instance."""
+    """Return classifier -> class probabilities [C] for each usable instance."""
     probabilities = recognizer.infer(instances, answer_by="classifiers")[1].probabilities
     return [{name: values[row] for name, values in probabilities.items()} for row in range(len(instances))]
 

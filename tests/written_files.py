@@ -17,7 +17,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 @contextlib.contextmanager
 def files_of_the_user(*paths: Path) -> Iterator[None]:
-    """Write files that this software has not written, and assert at the end that they are there and unchanged."""
+    """Write files as a user would, and assert at the end that they are there and unchanged."""
     for path in paths:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("a user's")

@@ -107,7 +107,8 @@ class ClassScores:
     def describe(self, aligned: PointClouds, cut: Strips, config: DescriptorConfig) -> LookDescriptors:
         """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
         oriented = describe_aligned_looks(aligned, cut, self.network, config, self.count)
-        if self.unit == "log-odds":  # The programs of classifiers are those of recognition.
+        # Only galleries read the balanced histogram; without it, classifiers use the programs of recognition.
+        if self.unit == "log-odds":
             return oriented
         return oriented.with_balanced(jax.tree.map(lambda a: a[:: self.count], aligned))
 

@@ -74,7 +74,7 @@ async def read_form(request: Request, form: dict[str, Any]) -> dict[str, Any]:
     if options.get(b"charset", b"utf-8").lower() not in (b"utf-8", b"iso-8859-1", b"us-ascii"):
         raise RequestError(415, "body", "The charset must be utf-8, iso-8859-1 or us-ascii.")
     parser = MultiPartParser(request.headers, _limited_stream(request), max_files=8, max_fields=8)
-    # The limit of the body applies first. Files beyond the second one would be written to a temporary file.
+    # No part reaches this limit, since the body has a lower one. Larger files would be written to a temporary file.
     parser.max_part_size = parser.spool_max_size = MAX_BODY + 1
     try:
         received = await parser.parse()

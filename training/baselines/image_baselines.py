@@ -322,7 +322,7 @@ def compare(
 ) -> NDArray[np.float32]:
     """Return class probabilities [V, C] for unit features [V, D]: a softmax of the largest similarities.
 
-    Every class has one of the templates, whose unit features are `stored` [T, D] and whose classes are `label` [T].
+    `stored` [T, D] are the unit features of the templates and `label` [T] their classes; every class has a template.
     """
     similarity = features @ stored.astype(np.float32).T
     nearest = np.stack([similarity[:, label == c].max(axis=1) for c in range(n_classes)], axis=1)

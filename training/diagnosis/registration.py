@@ -106,7 +106,7 @@ def label_edges(labels: NDArray[Any]) -> Field:
 
 
 def _reduced(color: NDArray[np.uint8], other: NDArray[Any]) -> tuple[int, Field, NDArray[Any]]:
-    """Return n, the spectrum of the colour edges, and the other image; both of every n-th pixel, about `WIDTH` columns.
+    """Reduce both images to about `WIDTH` columns; return the step, the spectrum of colour edges and the other image.
 
     The spectrum is the Fourier transform with a margin of `MAX_SHIFT`, padded to an efficient size.
     """

@@ -281,6 +281,7 @@ class _Recording:
 
     def read(self, number: int) -> RGBDFrame:
         if self._number > number:
+            self._number = math.inf  # the next read repeats a start that fails
             self._numbered = enumerate(_frames(self._open(), self._every))
             self._number, self._frame = next(self._numbered)
         while self._number < number:

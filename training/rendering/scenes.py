@@ -120,7 +120,7 @@ def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
 
 
 def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Iterator[Array]:
-    """Return positions [2] in line with a placed object and the camera, with the taller one in front."""
+    """Return an iterator over positions [2] in line with a placed object and the camera; the taller one is in front."""
     anchor = placed[int(rng.integers(len(placed)))]
     middle = (anchor.corners.min(axis=0) + anchor.corners.max(axis=0)) / 2
     sideways = np.array([-towards[1], towards[0]])

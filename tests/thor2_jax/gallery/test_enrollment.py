@@ -203,7 +203,7 @@ def test_unusable_views_are_refused_and_nothing_changes() -> None:
 
 
 def test_a_view_that_is_given_twice_counts_once() -> None:
-    """Also one that an object of another gallery has."""
+    """This includes a view that comes from another gallery."""
     recognizer, other = taught(run()), taught(run())
     recognizer.enroll("new", [BRICK, (CLUTTER, 1), BRICK])
     recognizer.enroll("new", [BRICK, BOOK, BOOK], extend=True)

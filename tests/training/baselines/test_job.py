@@ -91,10 +91,8 @@ def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_each_view_type_has_every_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All views of a class from above are held out, as can happen to a few random ones."""
-    above, trained = (
-        np.array(["top" in types for types in thor.types_of_views(SOURCE.record["job"])]),
-        list[Any](),
-    )
+    above = np.array(["top" in types for types in thor.types_of_views(SOURCE.record["job"])])
+    trained: list[set[int]] = []
 
     def fit(samples: Any, *args: Any, rows: Any) -> Any:
         trained.append(set(samples.label[rows[~args[3][rows]]]))

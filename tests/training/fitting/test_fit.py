@@ -178,9 +178,8 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
     monkeypatch.setattr(module, "SAMPLES_PER_BATCH", 3)
     views = MemoryViews({"brick": random_clouds(0, [90] * 2), "stick": random_clouds(1, [90] * 2)}, CLOSED_FORM)
     samples, _ = sample_views(views, NETWORK, CLOSED_FORM)
-    model = MLP(
-        input_size(feature, CLOSED_FORM, NETWORK.n_regions), 3, rngs=nnx.Rngs(0)
-    )  # the third class has no samples
+    # The third class has no samples.
+    model = MLP(input_size(feature, CLOSED_FORM, NETWORK.n_regions), 3, rngs=nnx.Rngs(0))
     rows = np.array([7, 0, 7, 3, 5])
     monkeypatch.setitem(sys.modules, "gudhi", None)  # a fit does not need it, whatever the descriptor of the run
     context = FitContext(feature, NETWORK, dataclasses.replace(CLOSED_FORM, homology="gudhi"))
