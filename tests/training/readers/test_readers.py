@@ -123,7 +123,7 @@ def test_frames_are_read_in_any_order(tmp_path: Path, every: int) -> None:
     sources, notes = recorded_sources(open_bag, every)
     assert not notes
     assert len({source.name for source in sources}) == len(sources) == len(RECORDED[::every])
-    for number in (0, 1, 1, 0, len(sources) - 1):
+    for number in (len(sources) - 1, 0, 1, 1, 0, 1):
         frame, expected = sources[number].read(), RECORDED[::every][number]
         np.testing.assert_array_equal(frame.color, expected.color)
         assert frame.labels is None
