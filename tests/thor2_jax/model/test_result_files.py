@@ -20,12 +20,13 @@ FRAME.depth[30:40] = 0
 ANSWERS = [Recognition(3, "mug", 0.75), Recognition(7, "bowl", 0.5), Recognition(5, None, 0.125, reason="unknown")]
 
 
-def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
-    tables = ResultTables(["8/7", "9/7"], ["bowl", "mug"])
+@pytest.mark.parametrize(("other", "image"), [("8/7", 2), ("9/8", 7)], ids=["several_scenes", "one_scene"])
+def test_pycocotools_loads_the_results(other: str, image: int, tmp_path: Path) -> None:
+    tables = ResultTables([other, "9/7"], ["bowl", "mug"])
     tables.add("9/7", FRAME, detections_of(FRAME, ANSWERS), 0.25)
     tables.write(coco=tmp_path / "results.json")
     dataset = COCO()
-    images, categories = [{"id": 2, "height": 240, "width": 320}], [{"id": 1}, {"id": 2}]
+    images, categories = [{"id": image, "height": 240, "width": 320}], [{"id": 1}, {"id": 2}]
     dataset.dataset = {"images": images, "annotations": [], "categories": categories}
     dataset.createIndex()
     loaded = dataset.loadRes(str(tmp_path / "results.json"))
@@ -35,7 +36,7 @@ def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
         mask = FRAME.label_image == answer.label
         entry = annotations[category]
         np.testing.assert_array_equal(loaded.annToMask(entry).astype(bool), mask)
-        assert entry["score"] == answer.confidence and entry["area"] == mask.sum() and entry["image_id"] == 2
+        assert entry["score"] == answer.confidence and entry["area"] == mask.sum() and entry["image_id"] == image
         np.testing.assert_array_equal(entry["bbox"], coco_mask.toBbox(entry["segmentation"]))
         assert entry["frame"] == "9/7" and entry["category_name"] == answer.name
     assert annotations[2]["bbox"] == [20, 20, 70, 80]
