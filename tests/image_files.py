@@ -1,5 +1,6 @@
 """Small frames, and files of images and frames."""
 
+import dataclasses
 import io
 import json
 import struct
@@ -103,9 +104,15 @@ FRAME_COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200,
 
 
 def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path:
-    """Write a labelled frame with a square for each object in the colour of its name, `seed` rows further down."""
-    squares = {label: (30 + seed, 10 + 50 * k, FRAME_COLORS[name]) for k, (label, name) in enumerate(objects.items())}
-    return write_frame_files(directory, frame_of_squares(squares), objects)
+    """Write a labelled frame with a rectangle for each object; each name has its colour and size."""
+    rng = np.random.default_rng(seed)
+    color = rng.integers(100, 120, (240, 320, 3), np.uint8)
+    mask = np.zeros((240, 320), np.uint8)
+    for place, (label, name) in enumerate(objects.items()):
+        window = slice(30, 140 if name == "brick" else 90), slice(20 + 100 * place, 100 + 100 * place)
+        mask[window] = label
+        color[window] = np.clip(np.array(FRAME_COLORS[name]) + rng.integers(-9, 10, (*mask[window].shape, 3)), 0, 255)
+    return write_frame_files(directory, dataclasses.replace(tilted(mask), color=color), objects)
 
 
 def instance_clouds(frame: thor2.RGBDFrame) -> list[PreparedInstance]:

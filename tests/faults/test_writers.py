@@ -1,16 +1,16 @@
 """All writers on a disk that becomes full at any step: no file is partial or lost."""
 
-import contextlib
+import builtins
 import errno
+import functools
+import io
 import os
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from failures import small_disk
 from matplotlib.figure import Figure
 from PIL import Image
 from small_clouds import NETWORK
@@ -32,33 +32,55 @@ class Disk:
     Opening for writing, writing, creating a directory and renaming each count once. Removing never fails.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.count, self.fail_at, self.limit = str(folder), 0, 0, contextlib.ExitStack()
-        sys.addaudithook(self.audit)  # until the process ends
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        self.folder, self.count, self.fail_at = str(folder), 0, 0
+        for module in (builtins, io):
+            patch.setattr(module, "open", self._opening(module.open))
+        for name in ("mkdir", "rename", "replace"):
+            patch.setattr(os, name, self._failing(getattr(os, name)))
+        patch.setattr(os, "open", self._failing(os.open, lambda flags, *_: flags & os.O_CREAT))
 
-    def audit(self, event: str, arguments: tuple[Any, ...]) -> None:
-        writes = event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR)
-        if (writes or event in ("os.mkdir", "os.rename")) and str(arguments[0]).startswith(self.folder):
-            path = Path(arguments[0])
+    def step(self, path: Any) -> None:
+        if isinstance(path, (str, os.PathLike)) and os.fspath(path).startswith(self.folder):
             self.count += 1
-            if 0 < self.fail_at <= self.count:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-            if writes:
-                self.count += 1
-                if self.fail_at == self.count:  # a part of the content still fits
-                    self.limit.enter_context(small_disk(1 + (path.stat().st_size if path.exists() else 0)))
+            if self.fail_at and self.count >= self.fail_at:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(path))
+
+    def _failing(self, function: Callable[..., Any], writes: Any = lambda *_: True) -> Callable[..., Any]:
+        def wrapper(path: Any, *rest: Any, **more: Any) -> Any:
+            if writes(*rest):
+                self.step(path)
+            return function(path, *rest, **more)
+
+        return wrapper
+
+    def _opening(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(path: Any, mode: str = "r", *rest: Any, **more: Any) -> Any:
+            if not set(mode) & set("wxa+") or not isinstance(path, (str, os.PathLike)):
+                return function(path, mode, *rest, **more)
+            self.step(path)
+            stream = function(path, mode, *rest, **more)
+            stream.write = functools.partial(self._write, path, stream.write)
+            return stream
+
+        return wrapper
+
+    def _write(self, path: Any, write: Callable[..., Any], content: Any) -> Any:
+        try:
+            self.step(path)
+        except OSError:
+            write(content[: len(content) // 2])  # the part that still fits
+            raise
+        return write(content)
 
     def fail_from(self, step: int) -> None:
         """Restart the count; fail from a step on, or never if it is 0."""
-        self.limit.close()
         self.count, self.fail_at = 0, step
 
 
 @pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Disk]:
-    disk = Disk(tmp_path)
-    yield disk
-    disk.fail_from(0)
+def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
+    return Disk(tmp_path, monkeypatch)
 
 
 PHOTO = np.zeros((40, 50, 3), np.uint8)
@@ -85,7 +107,7 @@ def test_files_are_written_atomically(name: str, tmp_path: Path, disk: Disk, mon
         try:
             WRITERS[name](path)
         except OSError as error:
-            assert error.errno in (errno.ENOSPC, errno.EFBIG) and error.filename == str(path)
+            assert error.errno == errno.ENOSPC and error.filename == str(path)
             assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
         else:
             break

@@ -299,7 +299,9 @@ def _around(frame: RGBDFrame, label: int) -> NDArray[np.float32]:
     x, y, _ = np.linspace(low, high, AROUND).T
     around = np.zeros((AROUND, AROUND, 3), np.float32)
     around[..., 0], around[..., 1] = x, y[:, None]
-    u, v = distort(around[..., 0], around[..., 1], camera.distortion)
+    u, v = around[..., 0], around[..., 1]
+    if camera.distortion:
+        u, v = distort(u, v, camera.distortion)
     columns, rows = np.rint(u * camera.fx + camera.cx), np.rint(v * camera.fy + camera.cy)
     inside = (rows >= RIM) & (rows < height - RIM) & (columns >= RIM) & (columns < width - RIM)
     pixels = np.where(inside, rows * width + columns, 0).astype(np.intp)

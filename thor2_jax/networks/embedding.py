@@ -289,8 +289,9 @@ class Embedding:
             "sizes": dataclasses.asdict(self.sizes),
             "classes": list(self.classes),
             "distractors": self.distractors,
-            **({"further": len(self.further)} if self.further else {}),
         }
+        if self.further:
+            about["further"] = len(self.further)
         arrays = model_arrays(self.model)
         for number, model in enumerate(self.further):
             arrays |= model_arrays(model, _FURTHER.format(number))

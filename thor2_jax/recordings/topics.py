@@ -78,7 +78,9 @@ def _choose(kind: str, wanted: str | None, kinds: Mapping[str, str], types: Mapp
     candidates = [topic for topic, held in kinds.items() if held == kind]
     if kind == "depth":
         candidates = [topic for topic in candidates if any(word in topic for word in _ALIGNED)] or candidates
-    candidates = [topic for topic in candidates if _uncompressed(topic) not in {*candidates} - {topic}]
+    candidates = [
+        topic for topic in candidates if _uncompressed(topic) == topic or _uncompressed(topic) not in candidates
+    ]
     if not candidates:
         advice = "; or give the file of the intrinsics" if kind == "camera" else ""
         raise InputError(

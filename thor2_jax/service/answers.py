@@ -32,7 +32,10 @@ MAX_SHOWN_POINTS = 1000
 
 def instance_answer(recognition: Recognition) -> schemas.InstanceAnswer:
     """Return the JSON record of one recognized instance."""
-    top = {source: [{"name": n, "probability": p} for n, p in best] for source, best in recognition.top.items()}
+    top = {
+        classifier: [schemas.Candidate(name=name, probability=p) for name, p in candidates]
+        for classifier, candidates in recognition.top.items()
+    }
     return schemas.InstanceAnswer(**{**vars(recognition), "top": top, "unrecognized": recognition.reason})
 
 

@@ -5,6 +5,7 @@ field.
 """
 
 import io
+import re
 import zipfile
 from collections.abc import AsyncGenerator, Callable, Mapping
 from functools import partial
@@ -73,9 +74,10 @@ async def read_form(request: Request, form: dict[str, Any]) -> dict[str, Any]:
     # Some Python codecs raise on undecodable input, and some take quadratic time.
     if options.get(b"charset", b"utf-8").lower() not in (b"utf-8", b"iso-8859-1", b"us-ascii"):
         raise RequestError(415, "body", "The charset must be utf-8, iso-8859-1 or us-ascii.")
-    parser = MultiPartParser(request.headers, _limited_stream(request), max_files=8, max_fields=8)
-    # No part reaches this limit, since the body has a lower one. Larger files would be written to a temporary file.
-    parser.max_part_size = parser.spool_max_size = MAX_BODY + 1
+    parser = MultiPartParser(
+        request.headers, _limited_stream(request), max_files=8, max_fields=8, max_part_size=MAX_BODY
+    )
+    parser.spool_max_size = MAX_BODY + 1  # Larger files would be written to a temporary file.
     try:
         received = await parser.parse()
     except MultiPartException as error:
@@ -112,7 +114,7 @@ def _parse_flag(field: str, text: str) -> bool:
 
 
 def _parse_number(field: str, text: str) -> int:
-    if not (text.isascii() and text.isdecimal() and len(text) <= 18):
+    if not re.fullmatch("[0-9]{1,18}", text):
         raise RequestError(422, field, f"{field} is {text[:40]!r}; expected a whole number of at most 18 digits.")
     return int(text)
 

