@@ -54,12 +54,14 @@ NEAR, SCALE, REFINEMENTS = 0.008, 0.002, 8
 """NEAR: distance, metres, beyond which points do not count in the last steps of a refinement. SCALE: point-to-plane
 distance, metres, at which points have half of the weight in `fit_poses`. REFINEMENTS: number of steps there."""
 
-N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-7, 2.7, 1.5, 0], np.float32)
-KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
+SYSTEMATIC = 0.002
+"""Errors of poses, meshes and depth that the roughness of an instance does not contain, metres."""
+
+N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-14, 2.7, 1.5, 0], np.float32)
+KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-8.4, 1.5, 1, -15], np.float32), np.float32(2.7)
 EXPONENT = np.float32(0.5)
-"""See `with_evidence`; the weights are in the order of `search_poses`. Logistic regressions on rendered views of four
-runs give similar weights, except the last one of `KNOWN_WEIGHTS`, of free space. The values other than weights are from
-real frames, since the probabilities of the networks depend more on the camera than surfaces do."""
+"""See `with_evidence`; the weights are in the order of `search_poses`. The values are from real frames, seen through
+random simulated cameras, since the probabilities of the networks and the noise of depth depend on the camera."""
 
 
 class Sample(NamedTuple):
@@ -179,8 +181,8 @@ def search_poses(surfaces: Surfaces, samples: Sample, class_index: jax.Array) ->
 
     Returns:
         The evidence [B, 4] float32 and the poses [B, 3, 4] of the search, zeros for an empty cloud. The evidence is the
-        logarithm of the mean point-to-plane distance divided by the roughness of the instance, the correlations of
-        chroma and of lightness, and the fraction of the surface in free space.
+        logarithm of the mean point-to-plane distance divided by the roughness of the instance (both plus `SYSTEMATIC`),
+        the correlations of chroma and of lightness, and the fraction of the surface in free space.
     """
 
     def fit(sample: Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -320,7 +322,7 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
     counted = matched | ~sample.rim  # masks may be too large
     plane = plane.mean(where=counted | ~counted.any())
     chroma, lightness = (_correlation(lab[k], entries[k], matched) for k in (np.s_[1:3], np.s_[:1]))
-    fit = jnp.log((plane + 3e-4) / (sample.rough + 3e-4))
+    fit = jnp.log((plane + SYSTEMATIC) / (sample.rough + SYSTEMATIC))
     return jnp.stack([fit, chroma, lightness, free[best]]), pose[best]
 
 

@@ -32,9 +32,10 @@ _SOURCES = {
 _SURFACES = (
     "Recognition also compares the points with the surfaces of the most probable objects, in the pose that fits best. "
     "This changes their probabilities, and decides whether the object is known. The distance is that of the points "
-    "from the surface, on average, divided by the roughness of the points: about 1 is a perfect fit. Chroma and "
-    "lightness are correlations between the colours of the points and those of the surface: 1 is a perfect fit. The "
-    "part of the surface in free space would lie in front of what the camera sees: 0 % is a perfect fit."
+    "from the surface, on average, divided by the roughness of the points, with 2 mm added to both: about 1 is a "
+    "perfect fit. Chroma and lightness are correlations between the colours of the points and those of the surface: 1 "
+    "is a perfect fit. The part of the surface in free space would lie in front of what the camera sees: 0 % is a "
+    "perfect fit."
 )
 
 _SHAPE = (
@@ -187,7 +188,7 @@ def _surfaces_table(explanation: Explanation) -> Table:
     rows = []
     for fit in explanation.surfaces:
         free = f"{100 * fit.free_space:.0f} %"
-        rows.append([fit.name, f"{fit.distance:.1f}", f"{fit.chroma:z.2f}", f"{fit.lightness:z.2f}", free])
+        rows.append([fit.name, f"{fit.distance:.2f}", f"{fit.chroma:z.2f}", f"{fit.lightness:z.2f}", free])
     return ["", "distance / roughness", "chroma", "lightness", "in free space"], rows
 
 

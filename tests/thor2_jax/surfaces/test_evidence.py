@@ -163,7 +163,7 @@ def test_few_points_and_noise_have_finite_evidence(surfaces: Surfaces) -> None:
 def test_points_beyond_the_surface_count_with_the_largest_distance(surfaces: Surfaces) -> None:
     points = (np.random.default_rng(0).random((2000, 3)) * 3 + [0, 0, 2]).astype(np.float32)
     clouds = PointClouds.pack([(points, np.zeros((2000, 3), np.uint8))])
-    expected = [np.log((0.012 + 3e-4) / (1e-3 + 3e-4)), 0, 0, 0]  # nothing is near, and no point has neighbours
+    expected = [np.log((0.012 + 0.002) / (0.001 + 0.002)), 0, 0, 0]  # nothing is near, and no point has neighbours
     np.testing.assert_allclose(evidence(surfaces, clouds, np.zeros(1, int))[0], expected, atol=0.01)
 
 
@@ -216,12 +216,12 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
         for k in np.argsort(-probabilities)[:5]:
             if probabilities[k] ** 0.5 * np.exp(1.5) >= largest:
                 best.append(k)
-                largest = max(largest, probabilities[k] ** 0.5 * np.exp(values[k][row] @ [-7, 2.7, 1.5, 0]))
-        odds = probabilities[best] ** 0.5 * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
+                largest = max(largest, probabilities[k] ** 0.5 * np.exp(values[k][row] @ [-14, 2.7, 1.5, 0]))
+        odds = probabilities[best] ** 0.5 * np.exp([values[k][row] @ [-14, 2.7, 1.5, 0] for k in best])
         probabilities[best] = probabilities[best].sum() * odds / odds.sum()
         known = probabilities.sum()
-        fits = values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15]
-        odds = probabilities.max() / known * (known / (1 - known)) ** 0.5 * np.exp(fits + 2.1)
+        fits = values[probabilities.argmax()][row] @ [-8.4, 1.5, 1, -15]
+        odds = probabilities.max() / known * (known / (1 - known)) ** 0.5 * np.exp(fits + 2.7)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
     nothing = np.zeros((9, n_classes), np.float32)
     assert np.array_equal(with_evidence(jnp.asarray(nothing), twice, samples), nothing)
