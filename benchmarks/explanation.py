@@ -59,7 +59,7 @@ def main() -> None:
             checks.append(check)
             print(
                 f"{directory.name}/{name} {label}: log-odds {check.margin:.2f}, without the most attributed tenth "
-                f"-{check.most_attributed:.2f}, without a random tenth -{check.random:.2f}",
+                f"{-check.most_attributed:+.2f}, without a random tenth {-check.random:+.2f}",
                 flush=True,
             )
         results[directory.name] = summary(checks)
