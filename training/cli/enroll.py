@@ -76,7 +76,7 @@ def enroll(
     from training.readers.frames import FrameFolder
     from training.storage.workers import IN_PROCESS
 
-    source = meshes or FrameFolder(frames, named=name is None)
+    source = meshes or FrameFolder(frames, named=None if target.instance is not None else name is None)
     pool = dataclasses.replace(processes, workers=min(processes.workers, len(meshes) or 1)).pool() or IN_PROCESS
     with show_progress(quiet) as progress:
         counts, known, notes = enroll_objects(model, source, name=name, pool=pool, progress=progress, **vars(target))

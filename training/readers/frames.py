@@ -170,22 +170,23 @@ class FrameFolder(LabelledFrames):
     `labels.json` contains {"labels": {"1": "mug", ...}}; other entries are ignored.
 
     Attributes:
-        named: whether the frames have a labels.json.
+        named: whether the frames have names, each in a labels.json.
         note: the frames that are left out because they have no labels.json; empty if there are none.
     """
 
-    def __init__(self, frames: str | Path | Sequence[FrameSource], *, named: bool = True) -> None:
+    def __init__(self, frames: str | Path | Sequence[FrameSource], *, named: bool | None = True) -> None:
         """Find the frames.
 
         Args:
             frames: a folder as for `find_frames`, or frames.
-            named: whether a labels.json is required. If False and no frame has one, all frames are used without names.
+            named: whether a labels.json is required. If False and no frame has one, all frames are used without names;
+                if None, they are even if some have one.
 
         Raises:
             InputError: the path is not a directory or contains no frame, or no frame has a labels.json.
         """
         sources = find_frames([Path(frames)]) if isinstance(frames, str | Path) else frames
-        labelled = [each for each in sources if each.files and each.files.names.is_file()]
+        labelled = [each for each in sources if named is not None and each.files and each.files.names.is_file()]
         self.named = bool(labelled)
         if named and not self.named:
             names = first_names([each.name for each in sources])

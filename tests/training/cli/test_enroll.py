@@ -72,6 +72,13 @@ def test_frames_without_labels_are_listed(model: Path, frames: Path, printed: Co
         assert "frames without labels.json: 1 (001)" in printed(*command, "--model", model).replace("\n", " ")
 
 
+def test_instance_numbers_need_no_labels_json(model: Path, frames: Path) -> None:
+    (frames / "000" / "labels.json").write_text("{")
+    (frames / "001" / "labels.json").unlink()
+    assert run_thor2("enroll", "thing", "--frames", frames, "--instance", 5, "--model", model) == 0
+    assert view_counts(model)["thing"] == 2
+
+
 def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path, refused: Command) -> None:
     frames = tmp_path / "test"
     write_frame(frames / "a", {2: "book", 3: "brick", 4: "leaf"}, 7)
