@@ -13,7 +13,6 @@ from typing import Any
 
 from thor2_jax import InputError, Recognizer
 from thor2_jax.files import atomic_directory
-from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import ObjectGallery, embedded_object
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_open_to_changes
@@ -88,7 +87,6 @@ def enroll_objects(
         check_open_to_changes(gallery or run / GALLERY_DIRECTORY)
         if name is not None:
             objects.gallery.name_to_enroll(name, extend=extend, replace=replace)
-        views: Iterator[Sequence[PreparedInstance]]
         surfaces: Iterator[Any] = itertools.repeat(None)
         if isinstance(source, FrameFolder):
             instances = read_instances(source, recognizer.run.config.sigma_s, label_name or name, instance)

@@ -316,6 +316,7 @@ class ObjectGallery:
                 is enrolled.
             OSError: the gallery cannot be written; it is unchanged.
         """
+        self.refresh()  # another process may have forgotten the object
         name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
         clouds = self.new_views(name, views, surface, extend=extend)
         if clouds or not views:

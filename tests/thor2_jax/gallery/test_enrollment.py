@@ -274,6 +274,15 @@ def test_a_run_directory_keeps_its_gallery(monkeypatch: pytest.MonkeyPatch, tmp_
     assert first.classes == ("brick", "book")
 
 
+def test_an_object_forgotten_elsewhere_is_enrolled_again(tmp_path: Path) -> None:
+    save_run(dataclasses.replace(untrained_run((), ()), embedding=embedding()), tmp_path)
+    first, second = thor2.Recognizer.load(tmp_path), thor2.Recognizer.load(tmp_path)
+    for extend in (False, False, True):
+        first.enroll("brick", [BRICK], extend=extend)
+        assert thor2.Recognizer.load(tmp_path).classes == ("brick",)
+        second.forget("brick")
+
+
 def test_another_embedding_embeds_the_views_again(tmp_path: Path) -> None:
     path, other = tmp_path / "run", small_embedding(1)
     save_run(untrained_run((), ()), path)
