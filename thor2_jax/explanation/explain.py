@@ -90,7 +90,7 @@ class SurfaceFit:
 
     Attributes:
         name: name of the object.
-        distance: mean point-to-plane distance, divided by the roughness of the instance (both plus 2 mm).
+        distance: mean point-to-plane distance, divided by the roughness of the instance (both plus 8 % of its size).
         chroma: correlation of chroma, from -1 to 1.
         lightness: correlation of lightness, from -1 to 1.
         free_space: fraction of the surface in free space.

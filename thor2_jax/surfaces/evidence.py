@@ -54,11 +54,12 @@ NEAR, SCALE, REFINEMENTS = 0.008, 0.002, 8
 """NEAR: distance, metres, beyond which points do not count in the last steps of a refinement. SCALE: point-to-plane
 distance, metres, at which points have half of the weight in `fit_poses`. REFINEMENTS: number of steps there."""
 
-SYSTEMATIC = 0.002
-"""Errors of poses, meshes and depth that the roughness of an instance does not contain, metres."""
+SYSTEMATIC, SMALLEST = 0.08, 0.01
+"""SYSTEMATIC: errors of meshes, poses and depth, which the roughness of an instance does not contain, divided by its
+size: the root mean square distance of its points from their centroid. SMALLEST: least size that is used, metres."""
 
-N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-14, 2.7, 1.5, 0], np.float32)
-KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-8.4, 1.5, 1, -15], np.float32), np.float32(2.7)
+N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-21, 2.7, 1.5, 0], np.float32)
+KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-11.2, 1.5, 1, -15], np.float32), np.float32(2.55)
 EXPONENT = np.float32(0.5)
 """See `with_evidence`; the weights are in the order of `search_poses`. The values are from real frames, seen through
 random simulated cameras, since the probabilities of the networks and the noise of depth depend on the camera."""
@@ -181,8 +182,8 @@ def search_poses(surfaces: Surfaces, samples: Sample, class_index: jax.Array) ->
 
     Returns:
         The evidence [B, 4] float32 and the poses [B, 3, 4] of the search, zeros for an empty cloud. The evidence is the
-        logarithm of the mean point-to-plane distance divided by the roughness of the instance (both plus `SYSTEMATIC`),
-        the correlations of chroma and of lightness, and the fraction of the surface in free space.
+        logarithm of the mean point-to-plane distance divided by the roughness of the instance (both plus `SYSTEMATIC`
+        times its size), the correlations of chroma and of lightness, and the fraction of the surface in free space.
     """
 
     def fit(sample: Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -322,7 +323,8 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
     counted = matched | ~sample.rim  # masks may be too large
     plane = plane.mean(where=counted | ~counted.any())
     chroma, lightness = (_correlation(lab[k], entries[k], matched) for k in (np.s_[1:3], np.s_[:1]))
-    fit = jnp.log((plane + SYSTEMATIC) / (sample.rough + SYSTEMATIC))
+    error = SYSTEMATIC * jnp.maximum(jnp.linalg.norm(sample.points.std(axis=0)), SMALLEST)
+    fit = jnp.log((plane + error) / (sample.rough + error))
     return jnp.stack([fit, chroma, lightness, free[best]]), pose[best]
 
 

@@ -32,10 +32,10 @@ _SOURCES = {
 _SURFACES = (
     "Recognition also compares the points with the surfaces of the most probable objects, in the pose that fits best. "
     "This changes their probabilities, and decides whether the object is known. The distance is that of the points "
-    "from the surface, on average, divided by the roughness of the points, with 2 mm added to both: about 1 is a "
-    "perfect fit. Chroma and lightness are correlations between the colours of the points and those of the surface: 1 "
-    "is a perfect fit. The part of the surface in free space would lie in front of what the camera sees: 0 % is a "
-    "perfect fit."
+    "from the surface, on average, divided by the roughness of the points, with 8 % of the size of the instance added "
+    "to both: about 1 is a perfect fit. Chroma and lightness are correlations between the colours of the points and "
+    "those of the surface: 1 is a perfect fit. The part of the surface in free space would lie in front of what the "
+    "camera sees: 0 % is a perfect fit."
 )
 
 _SHAPE = (
