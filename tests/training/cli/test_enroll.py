@@ -72,13 +72,6 @@ def test_frames_without_labels_are_listed(model: Path, frames: Path, printed: Co
         assert "frames without labels.json: 1 (001)" in printed(*command, "--model", model).replace("\n", " ")
 
 
-def test_instance_numbers_need_no_labels_json(model: Path, frames: Path) -> None:
-    (frames / "000" / "labels.json").write_text("{")
-    (frames / "001" / "labels.json").unlink()
-    assert run_thor2("enroll", "thing", "--frames", frames, "--instance", 5, "--model", model) == 0
-    assert view_counts(model)["thing"] == 2
-
-
 def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path, refused: Command) -> None:
     frames = tmp_path / "test"
     write_frame(frames / "a", {2: "book", 3: "brick", 4: "leaf"}, 7)
@@ -118,11 +111,15 @@ def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path, pri
 
 
 def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command, printed: Command) -> None:
-    """They have the object as their only instance, or --instance names it; so do the segments of a recording."""
+    """They have the object as their only instance, or --instance names it; so do the segments of a recording.
+
+    With --instance, labels.json is not read.
+    """
     for folder in ("000", "001"):
         (frames / folder / "labels.json").unlink()
     error = refused("enroll", "new", frames, "--model", model)
     assert "2 instances" in error and "--instance" in error
+    (frames / "000" / "labels.json").write_text("{")
     assert run_thor2("enroll", "new", frames, "--instance", 5, "--model", model) == 0
     (write_frame(tmp_path / "one", {3: "leaf"}) / "labels.json").unlink()
     assert run_thor2("enroll", "only", *frame_options(tmp_path / "one"), "--model", model) == 0
