@@ -6,11 +6,27 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from image_files import write_frame_files
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView
 from training.rendering.scenes import compose_scene
+
+QUAD = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]])
+QUAD_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+
+
+def textured_quad(material: PBRMaterial | SimpleMaterial, uv: np.ndarray = QUAD_UV) -> trimesh.Trimesh:
+    """Return a square of 0.1 m with texture coordinates."""
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(QUAD, QUAD_FACES, visual=visual, process=False)
+
+
+def colored(vertices: np.ndarray, colors: ArrayLike = ((99, 99, 99),) * 4) -> trimesh.Trimesh:
+    """Return the square, or one with other vertices, with a colour for each vertex."""
+    return trimesh.Trimesh(vertices, QUAD_FACES, vertex_colors=colors, process=False)
 
 
 def write_box(path: Path, sides: Sequence[float], color: Sequence[int] = (200, 100, 50)) -> Path:

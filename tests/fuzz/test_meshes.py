@@ -11,6 +11,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from rendered_objects import QUAD, colored, textured_quad
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from thor2_jax.frames.frames import encode_image
@@ -19,24 +20,16 @@ from training.objects.meshes import load_mesh
 
 from .conftest import other_content
 
-QUAD = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0.05]])
-FACES = np.array([[0, 1, 2], [0, 2, 3]])
-UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
 IMAGE = Image.fromarray(np.random.default_rng(0).integers(0, 256, (6, 5, 3), dtype=np.uint8))
-
-
-def textured(material: Any) -> trimesh.Trimesh:
-    visual = trimesh.visual.TextureVisuals(uv=UV, material=material)
-    return trimesh.Trimesh(QUAD, FACES, visual=visual, process=False)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("meshes")
-    painted = trimesh.Trimesh(QUAD, FACES, vertex_colors=np.arange(16, dtype=np.uint8).reshape(4, 4), process=False)
-    textured(PBRMaterial(baseColorTexture=IMAGE)).export(path / "textured.glb")
+    painted = colored(QUAD, np.arange(16, dtype=np.uint8).reshape(4, 4))
+    textured_quad(PBRMaterial(baseColorTexture=IMAGE)).export(path / "textured.glb")
     painted.export(path / "painted.glb")
-    textured(SimpleMaterial(image=IMAGE)).export(path / "quad.obj")
+    textured_quad(SimpleMaterial(image=IMAGE)).export(path / "quad.obj")
     for name, encoding in (("binary", "binary"), ("text", "ascii")):
         (path / f"{name}.ply").write_bytes(trimesh.exchange.ply.export_ply(painted, encoding=encoding))
     assert all(load_mesh(path / name) for name in NAMES)

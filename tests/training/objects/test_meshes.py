@@ -14,30 +14,18 @@ import pytest
 import trimesh
 from PIL import Image
 from refusals import assert_refused
-from rendered_objects import write_box
+from rendered_objects import QUAD, QUAD_FACES, QUAD_UV, colored, textured_quad, write_box
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh, read_mesh, read_names, scaled_meshes
 from training.rendering.camera import RayCaster
 
-QUAD = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
-QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]])
-QUAD_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
 # Rows from the top: red, green / blue, white.
 CHECKERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
 TEXTURE = {"baseColorTexture": Image.fromarray(CHECKERS)}
 PBR = PBRMaterial(**TEXTURE)
 SIMPLE = SimpleMaterial(image=Image.fromarray(CHECKERS))
-
-
-def textured_quad(material: PBRMaterial | SimpleMaterial, uv: np.ndarray = QUAD_UV) -> trimesh.Trimesh:
-    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    return trimesh.Trimesh(QUAD, QUAD_FACES, visual=visual, process=False)
-
-
-def colored(vertices: np.ndarray, colors: Any = ((99, 99, 99),) * 4) -> trimesh.Trimesh:
-    return trimesh.Trimesh(vertices, QUAD_FACES, vertex_colors=colors, process=False)
 
 
 def quadrant_colors(mesh: TexturedMesh) -> list[list[int]]:
