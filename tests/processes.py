@@ -81,6 +81,12 @@ def free_port() -> int:
         return int(free.getsockname()[1])
 
 
+def run_python(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run Python with these arguments and return its exit status and its output."""
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=HANG)
+
+
 def start_program(code: str, *arguments: object, devices: int = 1) -> subprocess.Popen[str]:
     """Start a Python program on the CPU, which JAX divides into some devices."""
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"

@@ -2,14 +2,14 @@
 
 import json
 import re
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
 from image_files import small_frame, write_frame_files
-from processes import finish_programs, start_program
+from processes import run_python
 from refusals import assert_refused
 from rendered_objects import write_box
 from small_clouds import NETWORK, random_clouds
@@ -32,10 +32,10 @@ training.cli.main()
 """
 
 
-def run_without(*arguments: object, before: str = "") -> subprocess.CompletedProcess[str]:
+def run_without(*arguments: object, before: str = "") -> CompletedProcess[str]:
     """Run the command line in a process in which the packages of training cannot be imported."""
     program = PROGRAM.format(packages=TRAINING_PACKAGES, arguments=[*map(str, arguments)], before=before)
-    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    return run_python("-c", program)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,8 @@ def test_a_command_that_needs_training_says_so(tmp_path: Path) -> None:
 def test_training_on_given_views_needs_no_ray_caster() -> None:
     """Neither embreex nor gudhi has wheels for ARM on Linux."""
     program = "import sys; sys.modules |= dict.fromkeys(('embreex', 'gudhi')); import training.train_job"
-    finish_programs(start_program(program))
+    ended = run_python("-c", program)
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_gudhi_is_needed_only_where_it_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:

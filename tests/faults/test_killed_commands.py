@@ -1,15 +1,13 @@
 """Commands that are killed while they write: files under their final names are complete, and commands resume."""
 
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import STEPS, Command, frame_options, run_thor2
 from image_files import small_frame, write_frame_files
-from processes import HANG
+from processes import run_python
 from small_runs import save_untrained_run
 from written_files import files_of
 
@@ -44,8 +42,7 @@ main()
 
 def kill(place: str, *command: object) -> None:
     """Run a command and kill it before or after it renames a file or directory to its place in --out or --model."""
-    arguments = [sys.executable, "-c", KILLED, place, *map(str, command)]
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=HANG)
+    done = run_python("-c", KILLED, place, *command)
     assert done.returncode == -signal.SIGKILL, done.stderr[-3000:]
 
 

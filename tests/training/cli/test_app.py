@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -18,7 +17,7 @@ from unittest import mock
 import pytest
 from commands import Command, run_thor2
 from image_files import write_frame
-from processes import HANG
+from processes import HANG, run_python
 from refusals import assert_refused
 from rich.progress import Progress
 from small_runs import save_untrained_run
@@ -31,10 +30,6 @@ from training.cli.options import FrameOptions
 from training.storage.jobs import cache_directory, numbered
 
 ROOT = Path(__file__).parents[3]
-
-
-def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=HANG)
 
 
 def test_closed_streams_are_no_error() -> None:
@@ -146,7 +141,7 @@ def test_objects_without_jax_or_all_characters(tmp_path: Path, monkeypatch: pyte
         "import thor2_jax.service.preparation\ntry: training.cli.main()\n"
         "except SystemExit as end: assert not end.code and 'jax' not in sys.modules"
     )
-    done = run_python("-c", code, "objects", "--model", str(tmp_path))
+    done = run_python("-c", code, "objects", "--model", tmp_path)
     assert done.returncode == 0 and r"1 object: t\xe9" in done.stdout, done.stderr
 
 
@@ -207,7 +202,7 @@ sys.modules["training.cli.app"].app = command
 signal.signal(int(sys.argv[3]), signal.SIG_DFL)  # under nohup, it is ignored
 sys.modules["training.cli.app"].main()
 """
-    done = run_python("-c", code, str(tmp_path), workers, str(int(number)))
+    done = run_python("-c", code, tmp_path, workers, int(number))
     assert (done.returncode, done.stderr) == (-number, "")
     assert not os.listdir(tmp_path)
 
@@ -389,7 +384,7 @@ def test_a_second_recognition_compiles_nothing(environment: Path, tmp_path: Path
 
     def recognize() -> tuple[set[str], str]:
         """Return the names of the cached programs, and what was printed."""
-        done = run_python("-m", "training.cli", "recognize", "--model", str(tmp_path / "run"), str(frame))
+        done = run_python("-m", "training.cli", "recognize", "--model", tmp_path / "run", frame)
         assert done.returncode == 0 and done.stderr == ""
         return {path.name for path in environment.glob("*/*-cache")}, done.stdout
 
