@@ -36,16 +36,29 @@ def knows(*objects: NDArray[np.bool_], frame: RGBDFrame = FRAME) -> Recognize:
     return lambda frames: [answer(shown) for shown in frames]
 
 
+def always(name: str | None, confidence: float) -> Recognize:
+    """Return a recognizer that gives one answer for everything."""
+    return lambda frames: [(name, confidence)] * len(frames)
+
+
+def same_name(frames: Sequence[RGBDFrame]) -> list[Answer]:
+    """Know both objects by one name."""
+    return [("a", confidence) for _, confidence in knows(TRUTH == 1, TRUTH == 2)(frames)]
+
+
+def assert_divided(labels: NDArray[np.int32], least: float) -> None:
+    """Assert that the piece is divided into the two objects, with at least some overlap each."""
+    assert labels.max() == 2 and (best_overlaps(labels, TRUTH) > least).all()
+    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+
+
 def nowhere(frame: RGBDFrame) -> dict[int, Distances]:
     """Locate no object."""
     return {}
 
 
 def test_a_piece_with_two_known_objects_is_divided() -> None:
-    labels = segment_known(FRAME, ONE_PIECE, knows(TRUTH == 1, TRUTH == 2), nowhere)
-    assert labels.max() == 2
-    assert (best_overlaps(labels, TRUTH) > 0.9).all()
-    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+    assert_divided(segment_known(FRAME, ONE_PIECE, knows(TRUTH == 1, TRUTH == 2), nowhere), 0.9)
 
 
 def test_only_pieces_of_one_known_object_are_merged() -> None:
@@ -69,20 +82,21 @@ def test_a_large_image_is_divided_at_a_lower_resolution() -> None:
 
 
 def test_frames_without_pieces_or_without_depth_remain() -> None:
-    unknown: Recognize = lambda frames: [(None, 0.0)] * len(frames)  # noqa: E731
-    assert not segment_known(FRAME, np.zeros_like(TRUTH), unknown, nowhere).any()
+    assert not segment_known(FRAME, np.zeros_like(TRUTH), always(None, 0.0), nowhere).any()
     frame = RGBDFrame(FRAME.color, np.zeros_like(FRAME.depth), None, FRAME.intrinsics)
-    np.testing.assert_array_equal(segment_known(frame, ONE_PIECE, unknown, nowhere), ONE_PIECE)
+    np.testing.assert_array_equal(segment_known(frame, ONE_PIECE, always(None, 0.0), nowhere), ONE_PIECE)
 
 
-@pytest.mark.parametrize("known", [TRUTH > 0, TRUTH == 1, (None, 0.99), ("a", 0.5), ("a", 0.99)])
-def test_a_piece_with_one_known_object_or_one_answer_remains(known: NDArray[np.bool_] | Answer) -> None:
-    recognize = (lambda frames: [known] * len(frames)) if isinstance(known, tuple) else knows(known)
+CONSTANT = (always(None, 0.99), always("a", 0.5), always("a", 0.99))
+
+
+@pytest.mark.parametrize("recognize", [knows(TRUTH > 0), knows(TRUTH == 1), *CONSTANT, same_name])
+def test_a_piece_with_one_known_object_or_one_name_remains(recognize: Recognize) -> None:
     np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize, nowhere), ONE_PIECE)
 
 
 def test_candidates_are_shown_where_they_are() -> None:
-    recognize = Mock(side_effect=lambda frames: [(None, 0.0)] * len(frames))
+    recognize = Mock(side_effect=always(None, 0.0))
     segment_known(FRAME, TRUTH, recognize, nowhere)
     shown = [frame for call in recognize.call_args_list for frame in call.args[0]]
     points = backproject(FRAME.depth_m, FRAME.intrinsics)[TRUTH == 1]
@@ -120,8 +134,7 @@ def test_pixels_of_other_surfaces_are_left_for_the_next_object(monkeypatch: pyte
         return [("0", 0.985) if whole else each for whole, each in zip(are_whole, alike(frames), strict=True)]
 
     labels = segment_known(FRAME, ONE_PIECE, recognize, located(*masks))
-    assert labels.max() == 2 and (best_overlaps(labels, TRUTH) > 0.98).all()
-    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+    assert_divided(labels, 0.98)
     np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize, nowhere), ONE_PIECE)
 
 
@@ -132,13 +145,12 @@ def test_an_object_gets_all_pixels_on_its_surface(monkeypatch: pytest.MonkeyPatc
     upper = (TRUTH == 1) & (np.arange(480)[:, None] < middle)
     recognize = knows(upper, TRUTH == 2)
     labels = segment_known(FRAME, ONE_PIECE, recognize, located(TRUTH == 1, TRUTH == 2))
-    assert labels.max() == 2 and (best_overlaps(labels, TRUTH) > 0.98).all()
-    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+    assert_divided(labels, 0.98)
 
 
 @pytest.mark.parametrize("seen", [0, 3])
 def test_a_surface_with_few_of_the_points_changes_no_mask(seen: int) -> None:
-    recognize = Mock(side_effect=lambda frames: [("0", 0.985)] * len(frames))
+    recognize = Mock(side_effect=always("0", 0.985))
 
     def locate(frame: RGBDFrame) -> dict[int, Distances]:
         return {1: lambda points: np.where(np.arange(len(points)) < seen, 0.0, 1.0)}
@@ -167,12 +179,6 @@ def test_what_is_left_is_unknown_unless_it_is_small_or_large(
     assert labels.max() == found
     assert found < 3 or (best_overlaps(labels, truth) > 0.95).all()
     np.testing.assert_array_equal(labels > 0, truth > 0)
-
-
-def test_a_piece_with_two_objects_of_one_name_remains() -> None:
-    apart = knows(TRUTH == 1, TRUTH == 2)
-    recognize: Recognize = lambda frames: [("a", confidence) for _, confidence in apart(frames)]  # noqa: E731
-    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize, nowhere), ONE_PIECE)
 
 
 @pytest.mark.parametrize("known", [(4, 7), (4,)], ids=["both known", "one known"])
