@@ -43,11 +43,6 @@ def test_a_match_has_the_largest_total_overlap() -> None:
     assert match([beside, near], [here])[0] == [(1, 0)] and not match([beside, near], [here])[1].any()
 
 
-def test_a_small_object_does_not_continue_a_large_one() -> None:
-    large, small, occluded = patch(0, 0, 0.16), patch(0.14, 0.06, 0.04), patch(0.04, 0.06, 0.06)
-    assert match([large], [small])[0] == [] and match([large], [small, occluded])[0] == [(0, 1)]
-
-
 def test_objects_that_move_alike_show_how_the_camera_moved() -> None:
     before = [patch(0), patch(0.3, 0.1, 0.06), patch(0.1, 0.25, 0.12)]
     shift, along_x = np.array([0.07, -0.05, 0.02]), np.array([1, 0, 0])
