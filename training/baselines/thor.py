@@ -126,9 +126,8 @@ def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
 def camera_types(azimuth: float, polar: float) -> tuple[ViewType, ...]:
     """Return the view types of a training camera at these angles, degrees; two where the ranges overlap."""
     lying = 40 <= polar <= 140
-    from_front = min(abs((azimuth - centre + 180) % 360 - 180) for centre in (0, 180))
-    from_side = min(abs((azimuth - centre + 180) % 360 - 180) for centre in (90, 270))
-    fits = {"front": lying and from_front <= 50, "side": lying and from_side <= 50, "top": polar <= 50 or polar >= 130}
+    from_front = abs((azimuth + 90) % 180 - 90)  # degrees to the nearest of front (0) and back (180)
+    fits = {"front": lying and from_front <= 50, "side": lying and from_front >= 40, "top": polar <= 50 or polar >= 130}
     return tuple(name for name in VIEW_TYPES if fits[name])
 
 
