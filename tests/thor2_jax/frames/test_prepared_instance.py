@@ -11,6 +11,7 @@ from refusals import assert_refused
 from scipy import ndimage
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.frames.prepared_instance import PreparedInstance, find_occlusion, pack_instances, prepare_instance
@@ -128,6 +129,26 @@ def count_lost(cloud: PreparedInstance, depth: np.ndarray, pixels: np.ndarray) -
     return int((KDTree(cloud.points).query(points)[0] > 0.003 * np.sqrt(3)).sum())
 
 
+def box_depth(rotation: np.ndarray, sides: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Return the depth of a box in metres, 0 where a ray misses it."""
+    start, direction = -centre @ rotation, RAYS @ rotation
+    ends = np.stack([(sign * sides / 2 - start) / direction for sign in (-1, 1)])
+    enters, leaves = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+    return np.where(enters < leaves, enters, 0)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_every_point_of_a_box_is_kept(seed: int) -> None:
+    """Includes corners and edges; no face is seen at more than about 65 degrees."""
+    rng = np.random.default_rng(seed)
+    turns = (Rotation.random(rng=rng).as_matrix() for _ in range(1000))
+    rotation = next(turn for turn in turns if (np.abs(turn[2]) > 0.45).all())
+    depth = box_depth(rotation, rng.uniform(0.05, 0.13, 3), np.array([0.01, -0.02, 0.8]))
+    cloud = only(frame_of(depth, (depth > 0).astype(np.uint8)))
+    assert (depth > 0).sum() > 2000
+    assert count_lost(cloud, depth, depth > 0) == 0 and not cloud.kept_by_fallback
+
+
 @pytest.mark.parametrize(("width", "fallback"), [(2, True), (4, False), (5, False), (8, False)])
 def test_a_flat_strip_is_kept(width: int, fallback: bool) -> None:
     """The strip is 0.26 m long and 3 mm to 1 cm wide; narrow ones may lose 1 cm at either end."""
@@ -171,6 +192,15 @@ def test_a_rule_that_is_skipped_leaves_the_other(monkeypatch: pytest.MonkeyPatch
     cloud = only(frame)
     assert cloud.kept_by_fallback and not expected.kept_by_fallback
     np.testing.assert_array_equal(cloud.points, expected.points)
+
+
+def test_the_bottom_of_a_cup_is_kept() -> None:
+    labels = label_image((1, 60, 180, 100, 220))
+    inside = label_image((1, 64, 176, 104, 216)) == 1
+    depth = np.where(inside, 0.9, 0.8)
+    cloud = only(frame_of(depth, labels))
+    flying = inside & ~ndimage.binary_erosion(inside)
+    assert count_lost(cloud, depth, (labels == 1) & ~flying) == 0
 
 
 @pytest.mark.parametrize(("deep", "flagged"), [(7, False), (8, False), (9, True)])
