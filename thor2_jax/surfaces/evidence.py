@@ -120,8 +120,8 @@ def with_evidence(
 ) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
-    Up to `N_COMPARED` classes are compared, in the order of their probabilities p, until the next one could not come
-    first: until p^`EXPONENT` exp(`GOOD_FIT`) is less than the largest p^`EXPONENT` exp(`NAME_WEIGHTS` e) so far. The
+    Up to `N_COMPARED` classes are compared, in the order of their probabilities p, until the next one is unlikely to
+    come first: p^`EXPONENT` exp(`GOOD_FIT`) is less than the largest p^`EXPONENT` exp(`NAME_WEIGHTS` e) so far. The
     compared classes share their total probability in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). The odds o of
     all classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`) for the class
     that is then most probable: s is its fraction of the total probability of all classes, and e its evidence.

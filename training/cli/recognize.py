@@ -110,7 +110,7 @@ class _Answers:
             out = out / answer.name
         if frame is None and out is not None:  # answers of an earlier call would look like new ones
             with contextlib.suppress(OSError):  # There is none, or the directory has other files.
-                for file in RESULT_FILES:
+                for file in reversed(RESULT_FILES):  # the first one shows that this command has written them
                     (out / file).unlink(missing_ok=True)
                 if self._several:
                     out.rmdir()

@@ -43,11 +43,23 @@ def test_output_for_one_frame(model: Path, recognize: Recognize, tmp_path: Path,
     assert "no instances" in background and "confidence" not in background
 
 
-def test_a_frame_that_fails_has_no_earlier_answer(model: Path, tmp_path: Path, refused: Command) -> None:
+def test_a_frame_that_fails_has_no_earlier_answer(
+    model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder, out = write_frame_files(tmp_path / "one", small_frame()), tmp_path / "out"
     command = ("recognize", "--model", model, *frame_options(folder), "--out", out)
     assert run_thor2(*command) == 0 and sorted(path.name for path in out.iterdir()) == sorted(RESULT_FILES)
     (folder / "depth.png").write_bytes(b"damaged")
+    unlink = Path.unlink
+
+    def interrupted(path: Path, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok)
+        if path.parent == out:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", interrupted)
+        assert run_thor2(*command) == 130 and len(list(out.iterdir())) == 1
     assert "depth.png" in refused(*command) and not list(out.iterdir())
 
 
