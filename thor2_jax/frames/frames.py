@@ -36,7 +36,6 @@ __all__ = [
     "decode_image",
     "encode_image",
     "frame_intrinsics",
-    "pixel_points",
     "pixel_rays",
     "read_color",
     "read_depth",
@@ -198,18 +197,11 @@ def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> 
 def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
     """Return the points [H, W, 3] of a depth image [H, W] in metres.
 
-    The frame is OpenCV's camera frame (x right, y down, z forward).
+    The frame is OpenCV's camera frame (x right, y down, z forward). Points are computed in float64 and returned in the
+    type of the depths.
     """
-    height, width = depth_m.shape
-    return pixel_points(np.arange(height * width), depth_m.ravel(), width, intrinsics).reshape(height, width, 3)
-
-
-def pixel_points(pixels: NDArray[np.intp], depth_m: NDArray[Any], width: int, intrinsics: Intrinsics) -> NDArray[Any]:
-    """Return the points [n, 3] of pixels (flat indices [n] of an image of this width) with depths [n] in metres.
-
-    They are computed in float64 and returned in the type of the depths, in the frame of `backproject`.
-    """
-    return (pixel_rays(pixels, width, intrinsics) * depth_m[:, None]).astype(depth_m.dtype)
+    rays = pixel_rays(np.arange(depth_m.size), depth_m.shape[1], intrinsics).reshape(*depth_m.shape, 3)
+    return (rays * depth_m[..., None]).astype(depth_m.dtype)
 
 
 class ImageSizeError(ValueError):
