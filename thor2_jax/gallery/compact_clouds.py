@@ -72,6 +72,13 @@ class CompactClouds:
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return CompactClouds(*(np.concatenate(pair) for pair in pairs))
 
+    def select(self, numbers: Sequence[int]) -> "CompactClouds":
+        """Return the views with these numbers, in this order; they are not rounded again."""
+        of_views = np.split(np.arange(len(self.points)), np.cumsum(self.counts)[:-1])
+        rows = np.concatenate([np.zeros(0, int), *(of_views[number] for number in numbers)])
+        points = self.points[rows], self.colors[rows], self.boundary[rows]
+        return CompactClouds(*points, self.counts[numbers], self.centre[numbers])
+
     def views(self) -> Iterator[PreparedInstance]:
         """Yield each view as a prepared instance, in metres."""
         ends = np.cumsum(self.counts)

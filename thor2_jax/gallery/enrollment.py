@@ -89,10 +89,11 @@ def _contents(clouds: CompactClouds) -> list[bytes]:
     return [view.points.tobytes() + view.colors.tobytes() + view.boundary.tobytes() for view in clouds.views()]
 
 
-def _new_views(clouds: CompactClouds, surface: object, stored: GalleryObject | None) -> dict[bytes, int]:
-    """Return the content and the number of each view that an object lacks; all, if it gets its first surface."""
+def _new_views(clouds: CompactClouds, surface: object, stored: GalleryObject | None) -> CompactClouds:
+    """Return the views that an object lacks, without repetitions; all, if it gets its first surface."""
     known = [] if stored is None or (surface is not None and stored.surface is None) else _contents(stored.clouds)
-    return {content: number for number, content in enumerate(_contents(clouds)) if content not in known}
+    new = {content: number for number, content in enumerate(_contents(clouds)) if content not in known}
+    return clouds.select([*new.values()])
 
 
 MAX_COPIES = 8
@@ -332,8 +333,7 @@ class ObjectGallery:
         Raises:
             InputError: a view has no points or is too large.
         """
-        new = _new_views(CompactClouds.of(views), surface, self.gallery.objects.get(name) if extend else None)
-        return CompactClouds.of([views[number] for number in new.values()])
+        return _new_views(CompactClouds.of(views), surface, self.gallery.objects.get(name) if extend else None)
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
@@ -343,9 +343,7 @@ class ObjectGallery:
                 # Another change may have added the same views, or some of them, since `new_views`.
                 new = _new_views(enrolled.clouds, enrolled.surface, gallery.objects.get(name) if extend else None)
                 if 0 < len(new) < len(enrolled.clouds):
-                    given = [*enrolled.clouds.views()]
-                    clouds = CompactClouds.of([given[number] for number in new.values()])
-                    enrolled = embedded_object(self.embedding, clouds, enrolled.source, enrolled.surface)
+                    enrolled = embedded_object(self.embedding, new, enrolled.source, enrolled.surface)
                 if new:
                     gallery = gallery.with_object(name, enrolled, extend=extend, replace=replace)
             return gallery

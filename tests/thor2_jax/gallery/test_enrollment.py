@@ -18,7 +18,7 @@ from small_runs import small_embedding, untrained_run
 from written_files import files_of
 
 import thor2_jax as thor2
-from thor2_jax.frames.prepared_instance import instance_view
+from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view
 from thor2_jax.gallery import store
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import ObjectGallery, views_to_embed
@@ -212,6 +212,17 @@ def test_a_view_that_is_given_twice_counts_once() -> None:
         recognizer.objects.add({"new": added.gallery.objects["new"]}, extend=True)
     expected = CompactClouds.of([instance_view(CLUTTER, label, 2.5) for label in (1, 2, 3)])
     jax.tree.map(np.testing.assert_array_equal, vars(recognizer.gallery.objects["new"].clouds), vars(expected))
+
+
+def test_views_of_another_gallery_are_not_rounded_again() -> None:
+    points = np.random.default_rng(0).random((4, 50, 3), np.float32) / 10
+    views = [PreparedInstance(0, each, np.zeros((50, 3), np.uint8), np.zeros(50, bool)) for each in points]
+    objects, other = taught(run()).objects, taught(run()).objects
+    objects.enroll("new", views[:1], "frames")
+    other.enroll("new", views, "frames")
+    objects.add({"new": other.gallery.objects["new"]}, extend=True)
+    expected = vars(CompactClouds.of(views))
+    jax.tree.map(np.testing.assert_array_equal, vars(objects.gallery.objects["new"].clouds), expected)
 
 
 def test_a_first_surface_comes_with_views_that_are_stored() -> None:
