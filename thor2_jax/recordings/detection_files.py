@@ -114,6 +114,7 @@ class MessageBag:
             # ROS 2 names the files of a bag after its directory.
             self._bag = folder / self._path.stem
             self._writer = Writer(self._bag, version=8, storage_plugin=plugin)
+            stack.callback(self._writer.abort)  # closes what an error leaves open
             self._writer.open()
             self._connections = {
                 topic: self._writer.add_connection(topic, kind, typestore=self._types)
@@ -124,7 +125,7 @@ class MessageBag:
 
     def __exit__(self, *_: object) -> None:
         """Close the bag and move it to `path`, or remove it if it is empty."""
-        with self._stack, _file_errors(self._path):
+        with _file_errors(self._path), self._stack:
             self._writer.close()
             if self._n_messages:
                 written = next(self._bag.glob("*.mcap")) if self._path.suffix == ".mcap" else self._bag
