@@ -1,9 +1,9 @@
 """Points of an instance: voxel grid and outlier removal (paper, section "Recognition").
 
 A mask extends past the edge of its object, onto the background and onto flying pixels between the two. Four rules
-remove these points: steps in depth show flying pixels, pixels at the contour that are far behind others show strips of
-background, the mean distance to the neighbours shows stray points, and small pieces that are separate from the rest are
-background.
+remove these points: steps in depth show flying pixels, pixels at the contour that are far behind others or on the plane
+around the mask show strips of background, the mean distance to the neighbours shows stray points, and small pieces that
+are separate from the rest are background.
 """
 
 import math
@@ -17,7 +17,7 @@ from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame
 
-__all__ = ["downsample_to_fit", "flying_pixels", "remove_outliers", "strip_pixels", "voxel_downsample"]
+__all__ = ["downsample_to_fit", "fit_plane", "flying_pixels", "remove_outliers", "strip_pixels", "voxel_downsample"]
 
 
 def voxel_downsample(
@@ -94,6 +94,14 @@ STRIP_STEP, STRIP_SLOPE = 0.05, 3.0
 """Smallest distance of background behind the nearest pixel of its cell and the eight adjacent cells: the larger of a
 step in metres and a slope over two cells, in pixel widths per pixel (72 degrees from facing the camera)."""
 
+ON_PLANE, PLANE_SHARE = 0.005, 0.3
+"""ON_PLANE: largest distance of a table's pixels from its plane, metres. PLANE_SHARE: smallest fraction of the
+background around a mask that lies on the plane of a table."""
+
+PLANE_MARGIN, PLANE_SAMPLES, HYPOTHESES = 12, 20, 64
+"""PLANE_MARGIN: smallest width of the region around a mask in which the table is searched, pixels. PLANE_SAMPLES:
+number of its rows and of its columns that are used. HYPOTHESES: number of planes that are compared."""
+
 NEIGHBORS = 30
 """Number of neighbours on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
 
@@ -135,15 +143,18 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
     return flying
 
 
-def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def strip_pixels(
+    frame: RGBDFrame, pixels: NDArray[np.intp], points: NDArray[np.float64], rim: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Return which pixels of an instance show the background beside an object, in a mask that is too large.
 
     Strips of a table beside an object are connected with it where it stands, so they are not separate pieces. Strips
-    wider than a cell may remain in part.
+    wider than two cells may remain in part.
 
     Args:
         frame: the frame.
         pixels: [n] flat indices of pixels of one instance.
+        points: [n, 3] their points, metres.
         rim: [n] whether a pixel is near the contour of the mask. Strips begin there. The bottom of a cup is far behind
             its edge, too, but is kept if the edge is wider than the rim.
 
@@ -152,6 +163,7 @@ def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.boo
     """
     depth = frame.depth_m.ravel()[pixels]
     row, column = np.divmod(pixels.astype(np.int32), frame.depth.shape[1])
+    on_table = _on_table(frame, row, column, points)
     side = max(MIN_CELL, max(frame.depth.shape) // 100)
     row, column = row // side, column // side
     row, column = row - row.min(), column - column.min()
@@ -163,9 +175,54 @@ def strip_pixels(frame: RGBDFrame, pixels: NDArray[np.intp], rim: NDArray[np.boo
     np.minimum.at(nearest.ravel(), cell[1:], np.maximum(valid[1:], valid[:-1]))
     nearest = ndimage.minimum_filter(nearest, 3)
     limit = np.maximum(nearest + STRIP_STEP, nearest * (1 + STRIP_SLOPE * 2 * side / frame.intrinsics.fx))
-    far = depth > limit.take(cell)
-    begins = np.bincount(cell[far & rim], minlength=limit.size).reshape(shape) > 0
-    return np.asarray(far & ndimage.maximum_filter(begins, 3).take(cell))
+    strip = (depth > limit.take(cell)) | on_table
+    begins = np.bincount(cell[strip & rim], minlength=limit.size).reshape(shape) > 0
+    return np.asarray(strip & ndimage.maximum_filter(begins, 3).take(cell))
+
+
+def _on_table(
+    frame: RGBDFrame, row: NDArray[np.int32], column: NDArray[np.int32], points: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return which pixels [n] of a mask lie on the plane of most background around it; none if most of them do."""
+
+    def around(place: NDArray[np.int32], size: int) -> NDArray[np.intp]:
+        margin = max(PLANE_MARGIN, int(np.ptp(place)) // 4)
+        low, high = max(place.min() - margin, 0), min(place.max() + margin, size - 1)
+        return np.linspace(low, high, PLANE_SAMPLES).astype(np.intp)
+
+    height, width = frame.depth.shape
+    beside = np.add.outer(around(row, height) * width, around(column, width)).ravel()
+    depth = frame.depth_m.ravel()[beside]
+    beside = beside[(frame.label_image.ravel()[beside] == 0) & (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)]
+    normal, offset, share = fit_plane(frame.points(beside), ON_PLANE)
+    on_table = np.abs(points @ normal - offset) < ON_PLANE
+    return on_table & (share >= PLANE_SHARE) & (2 * on_table.sum() <= len(on_table))
+
+
+def fit_plane(points: NDArray[np.floating[Any]], tolerance: float) -> tuple[NDArray[np.float64], float, float]:
+    """Find the plane that most points [n, 3] lie on, by RANSAC; equal points have equal planes.
+
+    Returns:
+        The unit normal [3] and the offset of the plane, which is the product of the normal and any of its points, and
+        the fraction of the points within `tolerance` of the plane. If no three points span a plane, they are zero,
+        infinity and zero, so that no point lies on it.
+    """
+    nothing = np.zeros(3), math.inf, 0.0
+    if len(points) < 3:
+        return nothing
+    corners = points[np.random.default_rng(0).integers(len(points), size=(HYPOTHESES, 3))].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    usable = lengths > 1e-6  # square metres; the three points do not lie in a line
+    if not usable.any():
+        return nothing
+    normals = normals[usable] / lengths[usable, None]
+    distances = np.abs(points @ normals.T - (normals * corners[usable, 0]).sum(axis=1))
+    inliers = points[distances[:, (distances < tolerance).sum(axis=0).argmax()] < tolerance]
+    center = inliers.mean(axis=0)
+    normal = np.linalg.eigh((inliers - center).T @ (inliers - center))[1][:, 0]
+    offset = float(normal @ center)
+    return normal, offset, float((np.abs(points @ normal - offset) < tolerance).mean())
 
 
 def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:

@@ -100,18 +100,18 @@ def instance_cloud(frame: RGBDFrame, label: int) -> PreparedInstance:
         expected = f"one of {listed}" if listed else "a frame with instances"
         raise InputError(f"instance is {label!r}; expected {expected}")
     pixels = frame.instance_pixels[label]
-    depth = frame.depth_m.ravel()[pixels]
+    depth, exact = frame.depth_m.ravel()[pixels], frame.points(pixels)
     trusted = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
     rim = _near_contour(frame, label, pixels)  # becomes a further colour channel
     skipped = False
-    for background in (flying_pixels(frame, pixels), strip_pixels(frame, pixels, rim)):
+    for background in (flying_pixels(frame, pixels), strip_pixels(frame, pixels, exact, rim)):
         rest = trusted & ~background
         if 2 * int(rest.sum()) < int(trusted.sum()):
             skipped = True
         else:
             trusted = rest
     valid = pixels[trusted]
-    points = frame.points(valid).astype(np.float32)
+    points = exact[trusted].astype(np.float32)
     channels = np.column_stack([frame.color.reshape(-1, 3).take(valid, axis=0), rim[trusted] * np.uint8(255)])
     try:
         points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from colornet.colors import LUMA
 from thor2_jax.frames.frames import RGBDFrame, backproject
+from thor2_jax.frames.outliers import fit_plane
 from training.rendering.camera import axial_deviation
 
 __all__ = ["CHOOSE", "REPORT", "SimulatedCamera", "through_camera"]
@@ -31,8 +32,6 @@ TABLE_MARGIN = 15
 
 TABLE_TOLERANCE = 0.006
 """Largest distance of a point of the table to its plane, metres."""
-
-N_HYPOTHESES = 150
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +118,7 @@ def through_camera(frame: RGBDFrame, camera: SimulatedCamera) -> RGBDFrame:
     rng = np.random.default_rng([zlib.crc32(camera.name.encode()), zlib.crc32(np.asarray(frame.depth).tobytes())])
     color = _color(frame.color, camera, rng)
     depth = _depth(frame.depth_m, camera, rng)
-    labels = None if frame.labels is None else _labels(frame, camera, rng)
+    labels = None if frame.labels is None else _labels(frame, camera)
     return RGBDFrame(color, depth, labels, dataclasses.replace(frame.intrinsics, depth_scale=1000.0))
 
 
@@ -158,7 +157,7 @@ def _ellipses(shape: tuple[int, ...], camera: SimulatedCamera, rng: np.random.Ge
     return holes
 
 
-def _labels(frame: RGBDFrame, camera: SimulatedCamera, rng: np.random.Generator) -> NDArray[np.integer]:
+def _labels(frame: RGBDFrame, camera: SimulatedCamera) -> NDArray[np.integer]:
     changed = labels = frame.label_image
     size = 2 * abs(camera.mask) + 1
     if camera.mask > 0:
@@ -167,7 +166,7 @@ def _labels(frame: RGBDFrame, camera: SimulatedCamera, rng: np.random.Generator)
         inside = minimum_filter(labels, size) == maximum_filter(labels, size)
         changed = _cut(changed, ~inside)
     if camera.base:
-        changed = _cut(changed, _near_table(frame, camera.base, rng))
+        changed = _cut(changed, _near_table(frame, camera.base))
     return changed
 
 
@@ -178,21 +177,10 @@ def _cut(labels: NDArray[np.integer], pixels: NDArray[np.bool_]) -> NDArray[np.i
     return np.where(pixels & (share <= 1 - MIN_MASK)[labels], 0, labels).astype(labels.dtype)
 
 
-def _near_table(frame: RGBDFrame, height: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _near_table(frame: RGBDFrame, height: float) -> NDArray[np.bool_]:
     """Return the pixels [H, W] within `height` metres of the plane that fits most points around the masks."""
     points = backproject(frame.depth_m, frame.intrinsics)
     labels, seen = frame.label_image, frame.depth_m > 0
     around = points[seen & (labels == 0) & (maximum_filter(labels, 2 * TABLE_MARGIN + 1) > 0)]
-    if len(around) < 3:
-        return np.zeros(labels.shape, bool)
-    sample = around[rng.integers(len(around), size=4000)]
-    corners = sample[rng.integers(len(sample), size=(N_HYPOTHESES, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    usable = lengths > 1e-6  # square metres; the three points do not lie in a line
-    if not usable.any():
-        return np.zeros(labels.shape, bool)
-    normals = normals[usable] / lengths[usable, None]
-    offsets = (normals * corners[usable, 0]).sum(axis=1)
-    best = (np.abs(sample @ normals.T - offsets) < TABLE_TOLERANCE).sum(axis=0).argmax()
-    return seen & (np.abs(points @ normals[best] - offsets[best]) < height)
+    normal, offset, _ = fit_plane(around[:: len(around) // 4000 + 1], TABLE_TOLERANCE)
+    return np.asarray(seen & (np.abs(points @ normal - offset) < height))

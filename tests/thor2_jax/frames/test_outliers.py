@@ -1,5 +1,6 @@
 """The voxel grid against cubes by NumPy, and outlier removal against loops and components by SciPy."""
 
+import math
 import re
 from typing import Any
 
@@ -11,7 +12,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.frames.outliers import downsample_to_fit, flying_pixels, remove_outliers, strip_pixels, voxel_downsample
+from thor2_jax.frames.outliers import (
+    downsample_to_fit,
+    fit_plane,
+    flying_pixels,
+    remove_outliers,
+    strip_pixels,
+    voxel_downsample,
+)
 
 CAMERA = Intrinsics(611.3, 620.0, 10.0, 8.0)
 
@@ -132,19 +140,34 @@ def test_strips_of_background_against_loops(distance: int, width: int, side: int
     depth[20, 30:33] = 50  # no camera measures so near
     labels = np.full(depth.shape, 7, np.uint8)
     labels[:5], labels[:, 54:], labels[30:40, 20:23] = 0, 3, 0
+    depth[labels == 0] = 0  # so that no table is found
     depth, labels = (np.pad(image, ((0, 0), (0, width - 58))) for image in (depth, labels))
     frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.uint16), labels, CAMERA)
     rim = (labels == 7) & ndimage.binary_dilation(labels != 7)
     for label, part in ((7, labels == 7), (3, labels == 3)):
         pixels = frame.instance_pixels[label]
-        strips = strip_pixels(frame, pixels, rim[part])
+        strips = strip_pixels(frame, pixels, frame.points(pixels), rim[part])
         expected = strips_by_loop(depth, list(map(tuple, np.argwhere(part).tolist())), rim[part], side)
         np.testing.assert_array_equal(strips, expected, strict=True)
     shown = np.zeros(depth.shape, bool)
-    shown.ravel()[frame.instance_pixels[7]] = strip_pixels(frame, frame.instance_pixels[7], rim[labels == 7])
+    pixels = frame.instance_pixels[7]
+    shown.ravel()[pixels] = strip_pixels(frame, pixels, frame.points(pixels), rim[labels == 7])
     assert shown[5:9, :54][depth[5:9, :54] > 0].mean() > 0.9
     assert shown[22:28, 30:36].any() == (side == 13)  # only larger cells reach from a contour with background
     assert shown[20:, 46:].any() == (distance == 600)  # far away, pixels are wider, so that the slope is flatter
+
+
+def test_planes_against_a_singular_value_decomposition() -> None:
+    """Three of ten points lie anywhere, the others within a millimetre of a plane."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (1000, 3))
+    points[300:, 2] = 0.3 * points[300:, 0] - 0.2 * points[300:, 1] + 2 + rng.uniform(-0.001, 0.001, 700)
+    normal, offset, share = fit_plane(points, 0.005)
+    center = points[300:].mean(axis=0)
+    expected = np.linalg.svd(points[300:] - center)[2][2]
+    assert abs(normal @ expected) > 1 - 1e-6 and abs(normal @ center - offset) < 1e-4 and 0.7 <= share < 0.71
+    for line in (points[:2], np.outer(np.arange(9.0), [1, 2, 3])):
+        assert fit_plane(line, 0.005)[1:] == (math.inf, 0)
 
 
 # Isolated points and connected components

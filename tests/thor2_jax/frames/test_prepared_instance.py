@@ -183,12 +183,28 @@ def test_a_strip_of_the_table_beside_an_object_is_dropped() -> None:
     assert cloud.points[:, 2].max() < 0.87
 
 
+@pytest.mark.parametrize("reach", [0, 3, 6])
+@pytest.mark.parametrize("height", [0.02, 0.1])
+def test_a_table_in_a_mask_that_is_too_large_is_dropped(height: float, reach: int) -> None:
+    """The camera looks at a box on a table, obliquely; no point of the table beside the box is 5 cm behind it."""
+    rotation, center = Rotation.from_euler("xz", [130, 20], degrees=True).as_matrix(), np.array([0.0, 0, 0.7])
+    box = box_depth(rotation, np.array([0.1, 0.08, height]), center)
+    up = rotation[:, 2]
+    table = (up @ center - height / 2) / (RAYS @ up)
+    depth = np.where(box > 0, box, table) + np.random.default_rng(reach).normal(0, 0.001, box.shape)
+    labels = ndimage.binary_dilation(box > 0, np.ones((3, 3)), iterations=reach) if reach else box > 0
+    cloud = only(frame_of(depth, labels.astype(np.uint8)))
+    above = (RAYS * depth[..., None] - center) @ up + height / 2
+    assert count_lost(cloud, depth, (box > 0) & (above > 0.01)) == 0 and not cloud.kept_by_fallback
+    assert ((cloud.points - center) @ up + height / 2 < 0.004).mean() < 0.002
+
+
 def test_a_rule_that_is_skipped_leaves_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
     module = "thor2_jax.frames.prepared_instance."
     frame = frame_of(flat(800), label_image((1, 60, 180, 100, 260)))
     monkeypatch.setattr(module + "flying_pixels", lambda _, pixels: np.arange(len(pixels)) < len(pixels) // 4)
     expected = only(frame)
-    monkeypatch.setattr(module + "strip_pixels", lambda _, pixels, rim: np.ones(len(pixels), bool))
+    monkeypatch.setattr(module + "strip_pixels", lambda _, pixels, *__: np.ones(len(pixels), bool))
     cloud = only(frame)
     assert cloud.kept_by_fallback and not expected.kept_by_fallback
     np.testing.assert_array_equal(cloud.points, expected.points)
@@ -197,7 +213,7 @@ def test_a_rule_that_is_skipped_leaves_the_other(monkeypatch: pytest.MonkeyPatch
 def test_the_bottom_of_a_cup_is_kept() -> None:
     labels = label_image((1, 60, 180, 100, 220))
     inside = label_image((1, 64, 176, 104, 216)) == 1
-    depth = np.where(inside, 0.9, 0.8)
+    depth = np.where(inside, 0.9, np.where(labels == 1, 0.8, 0.902))  # the bottom is nearly on the table
     cloud = only(frame_of(depth, labels))
     flying = inside & ~ndimage.binary_erosion(inside)
     assert count_lost(cloud, depth, (labels == 1) & ~flying) == 0
