@@ -117,6 +117,8 @@ class Bag:
                     f"bag: {self.path}: messages of an interrupted recording are in {log.name}; expected them in the "
                     f"database; repair it: sqlite3 {shlex.quote(str(log)[:-4])} 'PRAGMA wal_checkpoint(TRUNCATE)'"
                 )
+        # The directory of a ROS 2 bag may have any name, such as run.bag.
+        self._suffix = ".db3" if self.path.is_dir() else self.path.suffix
         with self._damage_named():
             if self.path.is_dir():
                 if not (self.path / "metadata.yaml").is_file():
@@ -125,9 +127,9 @@ class Bag:
                 files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
                 if not isinstance(files, list | None):
                     raise ValueError("files of metadata.yaml is not a list")
-            self.is_truncated = self.path.suffix == ".mcap" and _is_truncated(self.path)
+            self.is_truncated = self._suffix == ".mcap" and _is_truncated(self.path)
             # ROS's image definitions are used, which have not changed; rosbags would compile those of the file.
-            if self.path.suffix == ".bag":
+            if self._suffix == ".bag":
                 self._reader = Reader1(self.path)
                 self._deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
             else:
@@ -239,11 +241,10 @@ class Bag:
             raise
         except Exception as error:
             after = f" after {self.counts.color} colour images" if self.counts.color else ""
-            suffix = ".db3" if self.path.is_dir() else self.path.suffix
             raise InputError(
                 f"bag: {self.path} is damaged or of another format{after} ({reason_of(error).rstrip('.')}); expected a "
                 "ROS 1 bag (.bag), a ROS 2 bag (directory, .db3) or MCAP of ROS 2"
-                + (f"; repair it: {self._repair(suffix)}" if suffix in _REPAIR else "")
+                + (f"; repair it: {self._repair(self._suffix)}" if self._suffix in _REPAIR else "")
             ) from None
 
 

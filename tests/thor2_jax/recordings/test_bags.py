@@ -47,6 +47,8 @@ def test_frames_of_recordings(tmp_path: Path, name: str, is_compressed: bool) ->
         assert difference.mean() < 2 if is_compressed else difference.max() == 0
     if path.is_dir():
         assert len(frames_of(next(path.glob("*.db3")))) == 3
+        for suffix in (".bag", ".mcap"):
+            assert len(frames_of(path := path.rename(tmp_path / f"run{suffix}"))) == 3
 
 
 def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
