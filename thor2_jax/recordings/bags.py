@@ -107,7 +107,7 @@ class Bag:
             from rosbags.rosbag2 import Reader as Reader2
             from rosbags.typesys import Stores, get_typestore
 
-            _limit_decompression()
+            _adapt_rosbags()
         for file in [self.path, *self.path.glob("*")]:
             if not file.is_dir():
                 open_file(file).close()  # raises OSError for a pipe, which rosbags would read forever
@@ -249,8 +249,11 @@ class Bag:
 
 
 @functools.cache
-def _limit_decompression() -> None:
-    """Make rosbags raise ValueError beyond `MAX_DECOMPRESSED` bytes in this process; by itself it has no limit."""
+def _adapt_rosbags() -> None:
+    """Make rosbags raise ValueError beyond `MAX_DECOMPRESSED` bytes in this process; by itself it has no limit.
+
+    MCAP files without an index may have their messages in any order, since topics are recorded side by side.
+    """
     import apsw
     import lz4.frame
     from rosbags.rosbag1 import reader as rosbag1
@@ -260,6 +263,9 @@ def _limit_decompression() -> None:
     lz4_frame, zstd = _limited(lz4.frame.LZ4FrameDecompressor), _limited(rosbag2.zstd.ZstdDecompressor)
     rosbag1.decompressors.update(bz2=_limited(bz2.BZ2Decompressor), lz4=lz4_frame)
     storage_mcap.DECOMPRESSORS.update(lz4=lz4_frame, zstd=zstd)
+    mcap: Any = storage_mcap.McapReader
+    indexed, scan = mcap.messages, mcap.messages_scan
+    mcap.messages = lambda reader, *arguments: (indexed if reader.chunks else scan)(reader, *arguments)
     rosbag2.zstd = SimpleNamespace(decompress=zstd, open=functools.partial(_open_limited, rosbag2.zstd.open))
     # A computed column of a database can be larger than the file.
     hooks: list[Any] = apsw.connection_hooks

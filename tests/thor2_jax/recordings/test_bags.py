@@ -128,6 +128,17 @@ def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
         assert kept == 1, "a truncated recording was read without an error"
 
 
+def test_a_truncated_file_may_have_messages_in_any_order(tmp_path: Path) -> None:
+    with bag_writer(tmp_path / "a.mcap") as write:
+        for number in range(9):  # depth is recorded first, and written last
+            files.write_images(write, FRAMES[0], START + number * files.PERIOD, START + number * files.PERIOD, gap=-1)
+    content = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(content[: 3 * len(content) // 4])
+    with Bag(tmp_path / "a.mcap") as bag:
+        assert_refused("is truncated", list, bag.frames())
+        assert 4 < bag.counts.pairs < 9
+
+
 @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "folder/folder.db3", "folder/other"])
 def test_pipes_are_refused(tmp_path: Path, name: str) -> None:
     write_recording(tmp_path / "folder", FRAMES[:1])
