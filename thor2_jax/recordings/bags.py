@@ -252,7 +252,8 @@ class Bag:
 def _adapt_rosbags() -> None:
     """Make rosbags raise ValueError beyond `MAX_DECOMPRESSED` bytes in this process; by itself it has no limit.
 
-    MCAP files without an index may have their messages in any order, since topics are recorded side by side.
+    MCAP files without an index, also of the messages in their chunks, are read in the order in which they were written:
+    by itself, rosbags refuses such messages if they are not in the order of time, and finds none in such chunks.
     """
     import apsw
     import lz4.frame
@@ -265,7 +266,7 @@ def _adapt_rosbags() -> None:
     storage_mcap.DECOMPRESSORS.update(lz4=lz4_frame, zstd=zstd)
     mcap: Any = storage_mcap.McapReader
     indexed, scan = mcap.messages, mcap.messages_scan
-    mcap.messages = lambda reader, *arguments: (indexed if reader.chunks else scan)(reader, *arguments)
+    mcap.messages = lambda file, *args: (indexed if any(c.channel_count for c in file.chunks) else scan)(file, *args)
     rosbag2.zstd = SimpleNamespace(decompress=zstd, open=functools.partial(_open_limited, rosbag2.zstd.open))
     # A computed column of a database can be larger than the file.
     hooks: list[Any] = apsw.connection_hooks

@@ -139,6 +139,21 @@ def test_a_truncated_file_may_have_messages_in_any_order(tmp_path: Path) -> None
         assert 4 < bag.counts.pairs < 9
 
 
+def test_chunks_without_an_index_of_their_messages_are_read(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES)
+    content = bytearray(path.read_bytes())
+    place = int.from_bytes(content[-28:-20], "little")  # of the summary
+    while content[place] != 0x02:
+        end = place + 9 + int.from_bytes(content[place + 1 : place + 9], "little")
+        if content[place] == 0x08:  # the place of the index of each channel moves behind the fields that are read
+            length, rest = int.from_bytes(content[place + 41 : place + 45], "little"), place + 45
+            index = content[rest : rest + length]
+            content[place + 41 : end] = bytes(4) + content[rest + length : end] + index
+        place = end
+    path.write_bytes(content)
+    assert len(frames_of(path)) == 3
+
+
 @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "folder/folder.db3", "folder/other"])
 def test_pipes_are_refused(tmp_path: Path, name: str) -> None:
     write_recording(tmp_path / "folder", FRAMES[:1])
