@@ -60,7 +60,7 @@ def test_single_streams_and_streams_with_other_clocks_are_not_paired() -> None:
         assert counts.smallest_gap is not None and abs(counts.smallest_gap - hour) < 2 * LONGEST_WAIT + 7 * 10**9
 
 
-def test_of_equal_time_stamps_the_images_recorded_together_are_paired() -> None:
+def test_equal_time_stamps_are_paired_by_arrival() -> None:
     images = [StampedImage(is_color, 1, 33 * k * MS, k) for k in range(200) for is_color in (False, True)]
     pairs = list(nearest_pairs(images, MS, PairCounts()))
     assert [color.message for color, _ in pairs] == [depth.message for _, depth in pairs] == list(range(200))
