@@ -107,7 +107,7 @@ class Bag:
             from rosbags.rosbag2 import Reader as Reader2
             from rosbags.typesys import Stores, get_typestore
 
-            _limit_decompression()
+            _adapt_rosbags()
         for file in [self.path, *self.path.glob("*")]:
             if not file.is_dir():
                 open_file(file).close()  # raises OSError for a pipe, which rosbags would read forever
@@ -117,6 +117,8 @@ class Bag:
                     f"bag: {self.path}: messages of an interrupted recording are in {log.name}; expected them in the "
                     f"database; repair it: sqlite3 {shlex.quote(str(log)[:-4])} 'PRAGMA wal_checkpoint(TRUNCATE)'"
                 )
+        # The directory of a ROS 2 bag may have any name, such as run.bag.
+        self._suffix = ".db3" if self.path.is_dir() else self.path.suffix
         with self._damage_named():
             if self.path.is_dir():
                 if not (self.path / "metadata.yaml").is_file():
@@ -125,9 +127,9 @@ class Bag:
                 files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
                 if not isinstance(files, list | None):
                     raise ValueError("files of metadata.yaml is not a list")
-            self.is_truncated = self.path.suffix == ".mcap" and _is_truncated(self.path)
+            self.is_truncated = self._suffix == ".mcap" and _is_truncated(self.path)
             # ROS's image definitions are used, which have not changed; rosbags would compile those of the file.
-            if self.path.suffix == ".bag":
+            if self._suffix == ".bag":
                 self._reader = Reader1(self.path)
                 self._deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
             else:
@@ -239,17 +241,20 @@ class Bag:
             raise
         except Exception as error:
             after = f" after {self.counts.color} colour images" if self.counts.color else ""
-            suffix = ".db3" if self.path.is_dir() else self.path.suffix
             raise InputError(
                 f"bag: {self.path} is damaged or of another format{after} ({reason_of(error).rstrip('.')}); expected a "
                 "ROS 1 bag (.bag), a ROS 2 bag (directory, .db3) or MCAP of ROS 2"
-                + (f"; repair it: {self._repair(suffix)}" if suffix in _REPAIR else "")
+                + (f"; repair it: {self._repair(self._suffix)}" if self._suffix in _REPAIR else "")
             ) from None
 
 
 @functools.cache
-def _limit_decompression() -> None:
-    """Make rosbags raise ValueError beyond `MAX_DECOMPRESSED` bytes in this process; by itself it has no limit."""
+def _adapt_rosbags() -> None:
+    """Make rosbags raise ValueError beyond `MAX_DECOMPRESSED` bytes in this process; by itself it has no limit.
+
+    MCAP files without an index, also of the messages in their chunks, are read in the order in which they were written:
+    by itself, rosbags refuses such messages if they are not in the order of time, and finds none in such chunks.
+    """
     import apsw
     import lz4.frame
     from rosbags.rosbag1 import reader as rosbag1
@@ -259,6 +264,9 @@ def _limit_decompression() -> None:
     lz4_frame, zstd = _limited(lz4.frame.LZ4FrameDecompressor), _limited(rosbag2.zstd.ZstdDecompressor)
     rosbag1.decompressors.update(bz2=_limited(bz2.BZ2Decompressor), lz4=lz4_frame)
     storage_mcap.DECOMPRESSORS.update(lz4=lz4_frame, zstd=zstd)
+    mcap: Any = storage_mcap.McapReader
+    indexed, scan = mcap.messages, mcap.messages_scan
+    mcap.messages = lambda file, *args: (indexed if any(c.channel_count for c in file.chunks) else scan)(file, *args)
     rosbag2.zstd = SimpleNamespace(decompress=zstd, open=functools.partial(_open_limited, rosbag2.zstd.open))
     # A computed column of a database can be larger than the file.
     hooks: list[Any] = apsw.connection_hooks

@@ -75,7 +75,7 @@ def detection_types() -> Any:
 class MessageBag:
     """A ROS 2 bag or an MCAP file that is being written.
 
-    The bag appears when the context ends, even by an exception, if at least one message was written.
+    The bag appears when the context ends, even by an exception of something else, if at least one message was written.
     """
 
     argument = "path"
@@ -123,11 +123,12 @@ class MessageBag:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         """Close the bag and move it to `path`, or remove it if it is empty."""
         with _file_errors(self._path), self._stack:
             self._writer.close()
-            if self._n_messages:
+            # After an error of its own, such as a full disk, a database has lost all messages.
+            if self._n_messages and getattr(error, "filename", None) != str(self._path):
                 written = next(self._bag.glob("*.mcap")) if self._path.suffix == ".mcap" else self._bag
                 written.replace(self._path)
 

@@ -153,7 +153,8 @@ def nearest_pairs(
     def resolve(color: StampedImage) -> Iterator[tuple[StampedImage, StampedImage]]:
         if not depths:
             return
-        nearest = min(depths, key=lambda depth: abs(depth.stamp - color.stamp))
+        # Of depth images with the same time stamp, the one that was recorded next to the colour image is taken.
+        nearest = min(depths, key=lambda depth: (abs(depth.stamp - color.stamp), abs(depth.arrival - color.arrival)))
         while depths[0] is not nearest:  # nor is it nearest to a later colour image
             depths.popleft()
         gap = abs(nearest.stamp - color.stamp)
@@ -170,10 +171,10 @@ def nearest_pairs(
             counts.depth += 1
             depths.append(image)
         while colors and (
-            (depths and depths[-1].stamp >= colors[0].stamp) or image.arrival - colors[0].arrival > LONGEST_WAIT
+            (depths and depths[-1].stamp >= colors[0].stamp) or abs(image.arrival - colors[0].arrival) > LONGEST_WAIT
         ):
             yield from resolve(colors.popleft())
-        while len(depths) > 1 and image.arrival - depths[0].arrival > LONGEST_WAIT:
+        while len(depths) > 1 and abs(image.arrival - depths[0].arrival) > LONGEST_WAIT:
             depths.popleft()
     while colors:
         yield from resolve(colors.popleft())

@@ -37,7 +37,7 @@ FPS_FRAMES = 20
 """Number of frames over which the frame rate is averaged."""
 
 LONGEST_PAUSE = 2.0
-"""Largest time, seconds, that a frame may be late or early before the clock of the recording is reset."""
+"""Largest time, seconds, that a frame may be early before the clock of the recording is reset."""
 
 _JPEG_QUALITY = 80
 
@@ -46,13 +46,13 @@ def paced(frames: Iterable[RecordedFrame]) -> Iterator[RecordedFrame]:
     """Yield the frames of a recording at the speed at which they were taken; late frames are skipped.
 
     The clock is reset to the second frame if it is late, since the first one waits until programs are compiled, and to
-    any frame that is more than `LONGEST_PAUSE` late or early, because the recording has a gap.
+    any frame that is more than `LONGEST_PAUSE` early, or whose time stamp goes back, because the recording has a gap.
     """
-    offset = -math.inf  # from the time stamps to the clock
+    stamp = offset = -math.inf  # the offset is from the time stamps to the clock
     for number, frame in enumerate(frames):
-        stamp, now = frame.stamp / 1e9, time.monotonic()
+        previous, stamp, now = stamp, frame.stamp / 1e9, time.monotonic()
         ahead = stamp + offset - now
-        if not (0 if number == 1 else -LONGEST_PAUSE) <= ahead <= LONGEST_PAUSE:
+        if (ahead < 0 and number < 2) or ahead > LONGEST_PAUSE or stamp < previous:
             offset, ahead = now - stamp, 0.0
         if ahead >= 0:
             time.sleep(ahead)

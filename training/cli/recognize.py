@@ -76,8 +76,8 @@ class _Answers:
             for name in frames if several else [""]:
                 result_files.check_no_foreign_results(given.out / name)
         for (name, path), (other, same) in itertools.combinations(options.given_values(given).items(), 2):
-            if path.absolute() == same.absolute():
-                raise InputError(f"{name} and {other} are {path}; expected different paths")
+            if path.absolute().is_relative_to(same.absolute()):  # the bag could not be moved to its place at the end
+                raise InputError(f"{name} is {path} and {other} is {same}; expected {name} outside of that path")
         self._bag = None if given.out_bag is None else DetectionBag(given.out_bag)
         self._rerun = None if given.rerun is None else RerunFile(given.rerun)
         self._numbers = None if given.names is None else read_object_names(given.names)

@@ -3,7 +3,6 @@
 import contextlib
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -64,11 +63,10 @@ def watch(
         if any(each.files and each.files.labels is None for each in sources):
             segment = TABLE
             load_segmenter(TABLE)  # raises InputError if its package is missing, which frames with labels do not need
-        frames: Iterator[RecordedFrame]
-        if folder is not None:
-            frames = (RecordedFrame(each.name, each.read, number) for number, each in enumerate(sources))
-        elif bag is None:
+        if realsense:
             frames = stack.enter_context(RealSenseCamera()).frames()
+        elif folder is not None:
+            frames = (RecordedFrame(each.name, each.read, number) for number, each in enumerate(sources))
         else:
             opened = stack.enter_context(given_frames.open_bag())
             for note in opened.notes:

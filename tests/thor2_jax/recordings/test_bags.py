@@ -47,6 +47,8 @@ def test_frames_of_recordings(tmp_path: Path, name: str, is_compressed: bool) ->
         assert difference.mean() < 2 if is_compressed else difference.max() == 0
     if path.is_dir():
         assert len(frames_of(next(path.glob("*.db3")))) == 3
+        for suffix in (".bag", ".mcap"):
+            assert len(frames_of(path := path.rename(tmp_path / f"run{suffix}"))) == 3
 
 
 def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
@@ -124,6 +126,32 @@ def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
         assert str(path) in str(error)
     else:
         assert kept == 1, "a truncated recording was read without an error"
+
+
+def test_a_truncated_file_may_have_messages_in_any_order(tmp_path: Path) -> None:
+    with bag_writer(tmp_path / "a.mcap") as write:
+        for number in range(9):  # depth is recorded first, and written last
+            files.write_images(write, FRAMES[0], START + number * files.PERIOD, START + number * files.PERIOD, gap=-1)
+    content = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(content[: 3 * len(content) // 4])
+    with Bag(tmp_path / "a.mcap") as bag:
+        assert_refused("is truncated", list, bag.frames())
+        assert 4 < bag.counts.pairs < 9
+
+
+def test_chunks_without_an_index_of_their_messages_are_read(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES)
+    content = bytearray(path.read_bytes())
+    place = int.from_bytes(content[-28:-20], "little")  # of the summary
+    while content[place] != 0x02:
+        end = place + 9 + int.from_bytes(content[place + 1 : place + 9], "little")
+        if content[place] == 0x08:  # the place of the index of each channel moves behind the fields that are read
+            length, rest = int.from_bytes(content[place + 41 : place + 45], "little"), place + 45
+            index = content[rest : rest + length]
+            content[place + 41 : end] = bytes(4) + content[rest + length : end] + index
+        place = end
+    path.write_bytes(content)
+    assert len(frames_of(path)) == 3
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "folder/folder.db3", "folder/other"])

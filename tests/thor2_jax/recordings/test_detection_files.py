@@ -12,7 +12,7 @@ from recording_files import table_frame
 from refusals import assert_refused
 
 from thor2_jax.model.recognition import Recognition, detections_of
-from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
+from thor2_jax.recordings.detection_files import DetectionBag, MessageBag, RerunFile
 from thor2_jax.segmentation.segmenters import segmented
 
 ANSWERS = [Recognition(1, "mug", 0.9), Recognition(2, reason="unknown: 0.1", confidence=0.1)]
@@ -82,6 +82,14 @@ def test_a_database_on_a_full_disk_is_named(tmp_path: Path, size: int) -> None:
     assert caught.value.filename == str(path) and list(tmp_path.iterdir()) == []
     is_open = any(str(tmp_path) in os.path.realpath(file) for file in Path("/proc/self/fd").iterdir())
     assert not is_open or size == 1000  # rosbags leaves a database open if it cannot create its tables
+
+
+def test_a_database_that_lost_its_messages_is_not_kept(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="full"), MessageBag(tmp_path / "out", {"/name": "std_msgs/msg/String"}) as bag:
+        bag._writer.storage.conn.execute("PRAGMA max_page_count = 30")
+        for stamp in range(100):
+            bag.write_message("/name", {"data": "robot" * 1000}, stamp)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_is_noticed_before_rerun_waits_for_it(reader: Any, tmp_path: Path) -> None:

@@ -58,3 +58,17 @@ def test_single_streams_and_streams_with_other_clocks_are_not_paired() -> None:
         pairs, counts = pairs_of(images, 30 * MS)
         assert pairs == [] and counts.color == counts.depth == 200
         assert counts.smallest_gap is not None and abs(counts.smallest_gap - hour) < 2 * LONGEST_WAIT + 7 * 10**9
+
+
+def test_equal_time_stamps_are_paired_by_arrival() -> None:
+    images = [StampedImage(is_color, 1, 33 * k * MS, k) for k in range(200) for is_color in (False, True)]
+    pairs = list(nearest_pairs(images, MS, PairCounts()))
+    assert [color.message for color, _ in pairs] == [depth.message for _, depth in pairs] == list(range(200))
+
+
+def test_a_clock_that_is_set_back_delays_no_pairs() -> None:
+    times = [start + 33 * k * MS for start in (3600 * 10**9, 0) for k in range(100)]
+    images = [StampedImage(is_color, time, time, None) for time in times for is_color in (True, False)]
+    remaining = iter([*images[:199], *images[200:]])  # the last colour image of the first clock has no depth
+    pairs = nearest_pairs(remaining, 15 * MS, PairCounts())
+    assert [next(pairs)[0].stamp for _ in range(100)][-1] == 33 * MS and next(remaining, None) is not None

@@ -54,6 +54,8 @@ STAMPS = [100 + k / 10 for k in range(10)]
     [
         (STAMPS, [], [(stamp, stamp - 100) for stamp in STAMPS]),
         (STAMPS, [0.25] * 10, [(100, 0), (100.1, 0.25), (100.4, 0.55), (100.7, 0.85)]),
+        # However slow the work is, late frames are skipped.
+        ([100 + k for k in range(9)], [0, *[LONGEST_PAUSE + 1.5] * 9], [(100, 0), (101, 1), (105, 5)]),
         # A first frame that takes long, as programs are compiled, loses no others.
         (STAMPS, [LONGEST_PAUSE + 5, 0.25], [(100, 0), (100.1, 7), *[(stamp, stamp - 93.1) for stamp in STAMPS[4:]]]),
         # A gap, and time stamps that go back.
