@@ -95,7 +95,8 @@ def temporary_directory(parent: str | Path) -> Iterator[Path]:
             marker.write(_MARKER_TEXT)
             yield directory
     finally:
-        shutil.rmtree(directory, ignore_errors=True)
+        for path in (*directory.glob("*"), directory):  # the marker last: it identifies what a killed process leaves
+            shutil.rmtree(path, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -130,7 +131,8 @@ def remove_leftovers(directory: Path) -> None:
                     fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     is_left = marker.read() == _MARKER_TEXT
                 if is_left:  # remove it after closing the file, which network file systems would rename
-                    shutil.rmtree(path)
+                    for each in (*path.glob("*"), path):
+                        shutil.rmtree(each, ignore_errors=True)
 
 
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:

@@ -15,9 +15,6 @@ from training.readers.frames import FrameSource
 
 __all__ = ["adapt_run"]
 
-UNFINISHED = ("checkpoints", "views")
-"""Folders in a run directory that are not copied."""
-
 
 def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Report) -> Adaptation:
     """Estimate a camera's colour transform and write a run directory that corrects colours with it.
@@ -62,7 +59,8 @@ def _copy_files(model: Path, run: Path) -> None:
         raise error
 
     for folder, folders, names in os.walk(model, onerror=fail, followlinks=True):
-        folders[:] = [name for name in folders if name not in UNFINISHED and not name.startswith(".")]
+        # An unfinished training left the first two.
+        folders[:] = [name for name in folders if name not in ("checkpoints", "views") and not name.startswith(".")]
         target = run / Path(folder).relative_to(model)
         target.mkdir(exist_ok=True)
         for name in names:

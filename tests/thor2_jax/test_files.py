@@ -4,11 +4,13 @@ import errno
 import hashlib
 import os
 import re
+import shutil
 import signal
 import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from failures import small_disk
@@ -116,6 +118,21 @@ def test_the_next_write_removes_what_a_killed_process_left(tmp_path: Path) -> No
     with files.temporary_directory(tmp_path) as running:
         files.write_text(tmp_path / "b.txt", "")
         assert {path.name for path in tmp_path.iterdir()} == {running.name, "b.txt"} and list(running.iterdir())
+
+
+def test_an_interrupted_removal_can_be_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(path: Path, **options: Any) -> None:
+        rmtree(path, **options)
+        raise KeyboardInterrupt
+
+    rmtree = shutil.rmtree
+    with pytest.raises(KeyboardInterrupt), files.temporary_directory(tmp_path) as directory:
+        (directory / "views").mkdir()
+        monkeypatch.setattr("shutil.rmtree", interrupted)
+    monkeypatch.undo()
+    assert directory.exists()
+    files.remove_leftovers(tmp_path)
+    assert not directory.exists()
 
 
 def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:

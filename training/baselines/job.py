@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from flax import nnx
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import locked, remove_written
+from thor2_jax.files import locked, remove_leftovers, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines import cloud_baselines as clouds
 from training.baselines import image_baselines as images
@@ -174,6 +174,7 @@ def train_baselines(
                     "or leave out weights"
                 )
             # Checkpoints, including those of earlier versions and those of a process that was killed here.
+            remove_leftovers(file.parent)
             remove_written(task.scratch, r"\.lock", r"[^/]+/[0-9]+(\.safetensors|/.*)")
 
 

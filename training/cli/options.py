@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperCommand
 
 from thor2_jax.errors import InputError
+from thor2_jax.printable import normal_name
 from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, Topics
 from training.cli.app import option_arguments, print_note
 
@@ -261,7 +262,7 @@ class ManyFrames(TyperCommand):
 
 def split_names(names: str) -> list[str]:
     """Return the entries of a comma-separated option."""
-    return [name.strip() for name in names.split(",")] if names else []
+    return [normal_name(name) for name in names.split(",")] if names else []
 
 
 MAX_WORKERS = 1024

@@ -128,10 +128,8 @@ def _check_unchanged(file: AnswerFile, frames: LabelledFrames, out: Path, progre
                 "choose another directory"
             )
         if answers.files:
-            stored, current = answers.files.items(), _file_digests(frames.files(number)).items()
-            if stored != current:
-                path = min(stored ^ current)[0]
-                raise InputError(f"out: {out} was written before {path} changed; choose another directory")
+            if changed := answers.files.items() ^ _file_digests(frames.files(number)).items():
+                raise InputError(f"out: {out} was written before {min(changed)[0]} changed; choose another directory")
         progress("check files", number + 1, len(file.frames), "")
 
 

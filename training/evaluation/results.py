@@ -163,8 +163,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         np.add.at(confusion, (truth, predictions.class_index), 1)
 
     def of_runs(measure: Callable[[Predictions], float]) -> dict[str, Any]:
-        known = by_rule[DEFAULT_RULE]
-        return {title: summarize_runs([measure(each) for each in known[title].values()]) for title in known}
+        return {title: summarize_runs([*map(measure, each.values())]) for title, each in by_rule[DEFAULT_RULE].items()}
 
     counts, worst = _answers([*scored.known, *scored.unknown], runs)
     return {

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from thor2_jax import DescriptorConfig, InputError, view_normalize
 from thor2_jax.capacity import batch_points
 from thor2_jax.files import content_digest, read_table
+from thor2_jax.printable import find_name
 from thor2_jax.surfaces.surfaces import Surfaces
 from thor2_jax.types import Cloud, PointClouds, matmul
 from training.views.crops import ViewCrops
@@ -384,9 +385,9 @@ def sequence_sources(source: ViewSource, table: Path, out: Path) -> dict[Path, V
             raise InputError(f"sequences: {table} has the sequence {sequence!r}; expected a relative path")
         if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
             raise InputError(f"sequences: {table}: {sequence} is {names!r}; expected a list of names")
-        if missing := sorted(set(names) - set(source.classes)):
+        if missing := sorted(name for name in set(names) if not find_name(name, source.classes)):
             raise InputError(f"sequences: {table}: the views have no class {', '.join(missing)}, named by {sequence}")
-        sources[out / sequence] = WithoutClasses(source, [name for name in source.classes if name not in names])
+        sources[out / sequence] = WithoutClasses(source, [one for one in source.classes if not find_name(one, names)])
     if not sources:
         raise InputError(f"sequences: {table} has no sequence; expected a table of sequence -> object names")
     return sources

@@ -10,6 +10,7 @@ from commands import Command
 from refusals import assert_refused
 from small_clouds import NETWORK, brick_and_stick
 from small_runs import random_classifier, save_trained_run
+from written_files import killed
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
@@ -56,6 +57,8 @@ def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeyp
     """Baselines that a run has are not trained again."""
     monkeypatch.setitem(job._METHODS, "forest", (lambda task: pytest.fail("trained again"), load_forest))
     (trained / "baselines" / ".forest" / "fit").mkdir(parents=True)  # left by a process that was killed at its end
+    train_baselines(trained, SOURCE, names)
+    killed(trained / "baselines")
     train_baselines(trained, SOURCE, names)
     assert {path.name for path in (trained / "baselines").iterdir()} == {f"{name}.safetensors" for name in names}
     (run,) = load_runs([trained])

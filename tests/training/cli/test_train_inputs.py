@@ -14,6 +14,7 @@ from PIL import Image
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
 from training import train_job
+from training.cli.options import split_names
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_descriptors")
 TINY = ("--embedding", 0, "--orientation-copies", 0, "--classifiers", "ce", "--epochs", 1, "--batch-size", 4, "--quiet")
@@ -69,6 +70,10 @@ def test_frames_join_meshes(meshes: Path, frames: Path, tmp_path: Path, printed:
     assert "finished already" in printed("train", *command)
     for other in ((), ("--frames", frames / "0")):
         assert "with frames " in refused("train", "--meshes", meshes, *other, "--out", run, *STEPS, *TINY)
+
+
+def test_names_on_the_command_line_are_normalized() -> None:
+    assert split_names("cafe\u0301, mug") == ["caf\u00e9", "mug"]
 
 
 def test_invalid_inputs(

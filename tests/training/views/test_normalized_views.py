@@ -1,10 +1,12 @@
 """Random orientations of normalized views: the axes, and what a reoriented cloud keeps."""
 
+from pathlib import Path
+
 import numpy as np
 from small_clouds import random_clouds
 
 import thor2_jax as thor2
-from training.views.normalized_views import _random_axes, reorient
+from training.views.normalized_views import MemoryViews, _random_axes, reorient, sequence_sources
 
 
 def test_random_axes_are_rotations_that_swap_nearly_equal_sides() -> None:
@@ -31,3 +33,11 @@ def test_reoriented_clouds_are_rigid_and_in_the_first_octant() -> None:
         distances = [np.linalg.norm(a[:100] - a[101:], axis=1) for a in (cloud, before)]
         np.testing.assert_allclose(*distances, atol=1e-4)
     np.testing.assert_array_equal(turned.colors, normal.colors)
+
+
+def test_sequences_find_objects_in_other_unicode_forms(tmp_path: Path) -> None:
+    table = tmp_path / "table.json"
+    table.write_text('{"seq": ["cafe\\u0301", "mug"]}')
+    source = MemoryViews({"caf\u00e9": [], "mug": [], "box": []}, thor2.DescriptorConfig())
+    (views,) = sequence_sources(source, table, tmp_path).values()
+    assert views.classes == ("caf\u00e9", "mug")
