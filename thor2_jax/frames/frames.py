@@ -243,7 +243,9 @@ def decode_image(
         image.verify()  # decoding does not check the checksums of a PNG
     stream.seek(0)
     with Image.open(stream, formats=formats) as image:
-        is_deep = image.mode.startswith("RGB") and any(";16" in str(tile.args) for tile in image.tile)
+        # Pillow decodes 16 bits as 8 if a TIFF has them in one plane for each channel; the tiles do not show this.
+        bits = getattr(image, "tag_v2", {}).get(258, ())
+        is_deep = image.mode.startswith("RGB") and (16 in bits or any(";16" in str(tile.args) for tile in image.tile))
         return np.asarray(image), f"{image.mode};16" if is_deep else image.mode
 
 
@@ -362,9 +364,8 @@ def read_frame(
         OSError: a file cannot be opened.
     """
     label_image = None if labels is None else read_labels(labels)
-    return RGBDFrame(
-        read_color(color), read_depth(depth), label_image, frame_intrinsics(intrinsics, color, depth_scale)
-    )
+    camera = frame_intrinsics(intrinsics, color, depth_scale)
+    return RGBDFrame(read_color(color), read_depth(depth), label_image, camera)
 
 
 def frame_intrinsics(path: str | Path, color: str | Path, depth_scale: float | None = None) -> Intrinsics:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from failures import Pickled
 from image_files import encode_npy, png_of_zeros, write_frame_files
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 from refusals import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, encode_image, read_color, read_depth, read_frame, read_labels
@@ -207,6 +207,21 @@ def test_color_files_with_an_alpha_channel_of_16_bit_and_jpeg(tmp_path: Path) ->
     np.testing.assert_array_equal(read_color(tmp_path / "c.png"), rgba[..., :3])
     Image.new("RGB", (7, 5), (200, 100, 50)).save(tmp_path / "c.jpg", quality=95)
     np.testing.assert_allclose(read_color(tmp_path / "c.jpg"), np.full((5, 7, 3), (200.0, 100, 50)), atol=3)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_tiff_colors_with_a_plane_for_each_channel(tmp_path: Path, bits: int) -> None:
+    """Pillow reads 16-bit planes as if they had 8 bits, which gives other colours without an error."""
+    planes = np.random.default_rng(0).integers(0, 256, (3, 5, 7)).astype(f"<u{bits // 8}")
+    directory, size = TiffImagePlugin.ImageFileDirectory_v2(), planes[0].nbytes
+    entries = {256: 7, 257: 5, 258: (bits,) * 3, 259: 1, 262: 2, 273: (0, size, 2 * size), 277: 3, 278: 5, 284: 2}
+    for tag, value in entries.items():
+        directory[tag] = value  # 273: offsets of the planes, to which Pillow adds that of the end of the directory
+    (tmp_path / "c.tiff").write_bytes(b"II*\0\x08\0\0\0" + directory.tobytes(8) + planes.tobytes())
+    if bits == 16:
+        assert_refused("^color: .*;16", read_color, tmp_path / "c.tiff")
+    else:
+        np.testing.assert_array_equal(read_color(tmp_path / "c.tiff"), planes.transpose(1, 2, 0))
 
 
 # Depth files
