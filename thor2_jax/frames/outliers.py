@@ -98,9 +98,12 @@ ON_PLANE, PLANE_SHARE = 0.005, 0.3
 """ON_PLANE: largest distance of a table's pixels from its plane, metres. PLANE_SHARE: smallest fraction of the
 background around a mask that lies on the plane of a table."""
 
-PLANE_MARGIN, PLANE_SAMPLES, HYPOTHESES = 12, 20, 64
+PLANE_MARGIN, PLANE_SAMPLES = 12, 14
 """PLANE_MARGIN: smallest width of the region around a mask in which the table is searched, pixels. PLANE_SAMPLES:
-number of its rows and of its columns that are used. HYPOTHESES: number of planes that are compared."""
+number of its rows and of its columns that are used."""
+
+_CORNERS = np.random.default_rng(0).random((32, 3))
+"""Places in a list of points, from 0 to 1: three of them span a plane in `fit_plane`."""
 
 NEIGHBORS = 30
 """Number of neighbours on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
@@ -204,25 +207,22 @@ def fit_plane(points: NDArray[np.floating[Any]], tolerance: float) -> tuple[NDAr
 
     Returns:
         The unit normal [3] and the offset of the plane, which is the product of the normal and any of its points, and
-        the fraction of the points within `tolerance` of the plane. If no three points span a plane, they are zero,
-        infinity and zero, so that no point lies on it.
+        the fraction of the points that lie on the plane. If no three points span a plane, these are zero, infinity and
+        zero, so that no point lies on it.
     """
     nothing = np.zeros(3), math.inf, 0.0
-    if len(points) < 3:
+    if len(points) == 0:
         return nothing
-    corners = points[np.random.default_rng(0).integers(len(points), size=(HYPOTHESES, 3))].astype(np.float64)
+    corners = points[(_CORNERS * len(points)).astype(np.intp)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    usable = lengths > 1e-6  # square metres; the three points do not lie in a line
-    if not usable.any():
+    distances = np.abs(points @ normals.T - (normals * corners[:, 0]).sum(axis=1))  # times the lengths of the normals
+    is_near = distances < tolerance * np.linalg.norm(normals, axis=1)
+    inliers = points[is_near[:, is_near.sum(axis=0).argmax()]]
+    if len(inliers) == 0:
         return nothing
-    normals = normals[usable] / lengths[usable, None]
-    distances = np.abs(points @ normals.T - (normals * corners[usable, 0]).sum(axis=1))
-    inliers = points[distances[:, (distances < tolerance).sum(axis=0).argmax()] < tolerance]
     center = inliers.mean(axis=0)
     normal = np.linalg.eigh((inliers - center).T @ (inliers - center))[1][:, 0]
-    offset = float(normal @ center)
-    return normal, offset, float((np.abs(points @ normal - offset) < tolerance).mean())
+    return normal, float(normal @ center), len(inliers) / len(points)
 
 
 def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
