@@ -94,9 +94,10 @@ STRIP_STEP, STRIP_SLOPE = 0.05, 3.0
 """Smallest distance of background behind the nearest pixel of its cell and the eight adjacent cells: the larger of a
 step in metres and a slope over two cells, in pixel widths per pixel (72 degrees from facing the camera)."""
 
-ON_PLANE, PLANE_SHARE = 0.005, 0.3
-"""ON_PLANE: largest distance of a table's pixels from its plane, metres. PLANE_SHARE: smallest fraction of the
-background around a mask that lies on the plane of a table."""
+ON_PLANE, LOW, PLANE_SHARE = 0.005, 0.1, 0.3
+"""ON_PLANE: largest distance of a table's pixels from its plane, metres. LOW: the same divided by the height of the
+object, which is smaller for low objects. PLANE_SHARE: smallest fraction of the background around a mask that lies on
+the plane of a table."""
 
 PLANE_MARGIN, PLANE_SAMPLES = 12, 14
 """PLANE_MARGIN: smallest width of the region around a mask in which the table is searched, pixels. PLANE_SAMPLES:
@@ -186,7 +187,7 @@ def strip_pixels(
 def _on_table(
     frame: RGBDFrame, row: NDArray[np.int32], column: NDArray[np.int32], points: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return which pixels [n] of a mask lie on the plane of most background around it; none if most of them do."""
+    """Return which pixels [n] of a mask lie on the plane of most background around it."""
 
     def around(place: NDArray[np.int32], size: int) -> NDArray[np.intp]:
         margin = max(PLANE_MARGIN, int(np.ptp(place)) // 4)
@@ -198,8 +199,12 @@ def _on_table(
     depth = frame.depth_m.ravel()[beside]
     beside = beside[(frame.label_image.ravel()[beside] == 0) & (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)]
     normal, offset, share = fit_plane(frame.points(beside), ON_PLANE)
-    on_table = np.abs(points @ normal - offset) < ON_PLANE
-    return on_table & (share >= PLANE_SHARE) & (2 * on_table.sum() <= len(on_table))
+    seen = points[:, 2] > 0
+    if share < PLANE_SHARE or not seen.any():
+        return np.zeros(len(points), bool)
+    heights = np.abs(points @ normal - offset)
+    top = np.sort(heights[seen][::8])
+    return np.asarray(heights < min(ON_PLANE, LOW * top[len(top) * 19 // 20]))  # higher points may be flying pixels
 
 
 def fit_plane(points: NDArray[np.floating[Any]], tolerance: float) -> tuple[NDArray[np.float64], float, float]:
