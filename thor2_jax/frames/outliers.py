@@ -187,7 +187,7 @@ def strip_pixels(
 def _on_table(
     frame: RGBDFrame, row: NDArray[np.int32], column: NDArray[np.int32], points: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return which pixels [n] of a mask lie on the plane of most background around it."""
+    """Return which pixels [n] of a mask lie on the plane that has the most background around the mask."""
 
     def around(place: NDArray[np.int32], size: int) -> NDArray[np.intp]:
         margin = max(PLANE_MARGIN, int(np.ptp(place)) // 4)
