@@ -110,27 +110,22 @@ class _Supervisor(Multiprocess):
         """Start the workers."""
         with signals_blocked(signal.SIGINT, signal.SIGHUP):
             super().init_processes()
-        self._close_ends_of_workers()
 
     def keep_subprocess_alive(self) -> None:
         """Replace workers that have died; their requests no longer count as in progress."""
+        for process in self.processes:  # A health check ends at once if only the worker had its end of the pipe.
+            process.child_conn.close()
         before = {process.pid for process in self.processes}
         with signals_blocked(signal.SIGINT, signal.SIGHUP):
             super().keep_subprocess_alive()
         for pid in before - {process.pid for process in self.processes}:
             mark_process_dead(pid)
-        self._close_ends_of_workers()
 
     def terminate_all(self) -> None:
         """End the workers; new connections are refused at once, since no process accepts them any longer."""
         for listener in self.sockets:
             listener.close()
         super().terminate_all()
-
-    def _close_ends_of_workers(self) -> None:
-        """Leave each worker's end of its pipe to the worker: a health check then ends at once if the worker dies."""
-        for process in self.processes:
-            process.child_conn.close()
 
 
 def _create_worker(settings: Settings, workers: int, digest: str | None = None) -> FastAPI:

@@ -100,21 +100,22 @@ def test_ctrl_c_while_the_model_is_loaded(run_dir: Path, monkeypatch: pytest.Mon
     assert [*map(signal.getsignal, numbers)] == before
 
 
-@pytest.mark.parametrize("start", ["init_processes", "keep_subprocess_alive"])
-def test_workers_receive_no_ctrl_c_and_own_their_end_of_the_pipe(start: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_receive_no_ctrl_c_and_own_their_end_of_the_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
     """If a busy worker is killed, the health check ends at once; otherwise it would last for its timeout, a minute."""
     masks: list[set[signal.Signals]] = []
 
     def start_worker(supervisor: Any) -> None:
+        assert all(process.parent_conn.poll(0) for process in supervisor.processes)  # the end of the pipe
         masks.append(set(signal.pthread_sigmask(signal.SIG_BLOCK, ())))
         supervisor.processes = [Process(uvicorn.Config("no application"), [])]  # not started: it holds no pipe
 
-    monkeypatch.setattr(Multiprocess, start, start_worker)
     supervisor = object.__new__(server._Supervisor)
     supervisor.processes = []
-    getattr(supervisor, start)()
-    assert [mask & {signal.SIGINT, signal.SIGTERM, signal.SIGHUP} for mask in masks] == [{signal.SIGINT, signal.SIGHUP}]
-    assert supervisor.processes[0].parent_conn.poll(0)  # the end of the pipe
+    for start in ("init_processes", "keep_subprocess_alive", "keep_subprocess_alive"):
+        monkeypatch.setattr(Multiprocess, start, start_worker)
+        getattr(supervisor, start)()
+    blocked = {signal.SIGINT, signal.SIGHUP}
+    assert [mask & {signal.SIGTERM, *blocked} for mask in masks] == [blocked] * 3
 
 
 def test_preparation_processes_receive_no_signal_of_a_terminal() -> None:
