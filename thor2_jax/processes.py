@@ -11,33 +11,38 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-__all__ = ["Processes", "end_with_parent", "ended_by_signals", "signals_blocked"]
+__all__ = ["Processes", "end_with_parent", "ended_by_signals", "signals_blocked", "signals_handled"]
 
 MIN_SECONDS = 1.0
 """Shortest time that a process has for a call, so that only exceptionally slow calls are interrupted."""
 
 
 @contextlib.contextmanager
-def ended_by_signals() -> Iterator[None]:
-    """Let SIGINT and SIGTERM end this process at once inside the context, while there is no work to finish.
-
-    While modules and models are loaded, the exception of Python's handler can get lost, and with it the signal:
-    exceptions in callbacks, such as those of JAX for garbage collection, are ignored.
-    """
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+def signals_handled(actions: Mapping[signal.Signals, Any]) -> Iterator[None]:
+    """Handle these signals by these actions inside the context, except those that are ignored, as `nohup` does."""
+    previous = {number: signal.getsignal(number) for number in actions}
     for number, handler in previous.items():
-        signal.signal(number, handler if handler is signal.SIG_IGN else signal.SIG_DFL)
+        signal.signal(number, handler if handler is signal.SIG_IGN else actions[number])
     try:
         yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def ended_by_signals() -> contextlib.AbstractContextManager[None]:
+    """Let SIGINT, SIGTERM and SIGHUP end this process at once inside the context, while there is no work to finish.
+
+    While modules and models are loaded, the exception of Python's handler can get lost, and with it the signal:
+    exceptions in callbacks, such as those of JAX for garbage collection, are ignored.
+    """
+    return signals_handled(dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_DFL))
 
 
 @contextlib.contextmanager

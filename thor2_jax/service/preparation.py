@@ -151,7 +151,8 @@ def start_processes(count: int, segmenter: str | None = None) -> Processes:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
     # A terminal signals all processes; `Processes.close` ends these.
-    processes = Processes(count, context, functools.partial(_warm_up, segmenter), signal.SIGINT, signal.SIGTERM)
+    signals = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    processes = Processes(count, context, functools.partial(_warm_up, segmenter), *signals)
     for started in [processes.submit(os.getpid) for _ in range(count)]:
         started.result()
     return processes

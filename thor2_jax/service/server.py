@@ -24,7 +24,7 @@ from uvicorn.supervisors import Multiprocess
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest
 from thor2_jax.model.run_record import RUN_FILE
-from thor2_jax.processes import end_with_parent, ended_by_signals, signals_blocked
+from thor2_jax.processes import end_with_parent, ended_by_signals, signals_blocked, signals_handled
 from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.hosts import listening, page_headers
@@ -48,7 +48,7 @@ MAX_HEAD = 2**20
 
 
 def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers: int = 1) -> None:
-    """Serve until SIGTERM or SIGINT, then finish the accepted requests and return.
+    """Serve until SIGTERM, SIGINT or SIGHUP, then finish the accepted requests and return.
 
     A thread may still be compiling or computing explanations then; a normal exit of the process waits for it.
 
@@ -61,7 +61,9 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
     Raises:
         InputError: the run cannot be read, or the address is in use.
     """
-    with listening(host, port) as (listener, url):
+    # uvicorn raises SIGTERM again after the shutdown, and it then is like SIGINT. A closed terminal is like SIGTERM.
+    ending = {signal.SIGTERM: signal.default_int_handler, signal.SIGHUP: lambda *_: signal.raise_signal(signal.SIGTERM)}
+    with listening(host, port) as (listener, url), signals_handled(ending):
         digest = None
         if workers > 1:
             with ended_by_signals():
@@ -88,50 +90,42 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         if workers == 1:
             config.load()
             log.info("listening at %s", url)
-            # uvicorn raises the signal again after the shutdown; SIGTERM then is like SIGINT.
-            previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
-            try:
-                with contextlib.suppress(KeyboardInterrupt):
-                    uvicorn.Server(config).run([listener])
-            finally:
-                signal.signal(signal.SIGTERM, previous)
+            with contextlib.suppress(KeyboardInterrupt):
+                uvicorn.Server(config).run([listener])
         else:
             log.info("listening at %s; requests wait until a worker is ready", url)
-            listener.set_inheritable(True)
             # Workers inherit the directory of this process for sockets, which they leave, since they end by a signal.
             with tempfile.TemporaryDirectory(dir=get_temp_dir()) as directory:
                 os.environ["PROMETHEUS_MULTIPROC_DIR"] = directory
-                _Supervisor(config, [listener]).run()
+                on_hangup = signal.getsignal(signal.SIGHUP)
+                supervisor = _Supervisor(config, [listener])
+                signal.signal(signal.SIGHUP, on_hangup)  # uvicorn would replace the workers
+                supervisor.run()
 
 
 class _Supervisor(Multiprocess):
-    """uvicorn's supervisor; it alone receives the SIGINT of a terminal, and ends its workers with SIGTERM."""
+    """uvicorn's supervisor; it alone receives the signals of a terminal, and ends its workers with SIGTERM."""
 
     def init_processes(self) -> None:
         """Start the workers."""
-        with signals_blocked(signal.SIGINT):
+        with signals_blocked(signal.SIGINT, signal.SIGHUP):
             super().init_processes()
-        self._close_ends_of_workers()
 
     def keep_subprocess_alive(self) -> None:
         """Replace workers that have died; their requests no longer count as in progress."""
+        for process in self.processes:  # A health check ends at once if only the worker had its end of the pipe.
+            process.child_conn.close()
         before = {process.pid for process in self.processes}
-        with signals_blocked(signal.SIGINT):
+        with signals_blocked(signal.SIGINT, signal.SIGHUP):
             super().keep_subprocess_alive()
         for pid in before - {process.pid for process in self.processes}:
             mark_process_dead(pid)
-        self._close_ends_of_workers()
 
     def terminate_all(self) -> None:
         """End the workers; new connections are refused at once, since no process accepts them any longer."""
         for listener in self.sockets:
             listener.close()
         super().terminate_all()
-
-    def _close_ends_of_workers(self) -> None:
-        """Leave each worker's end of its pipe to the worker: a health check then ends at once if the worker dies."""
-        for process in self.processes:
-            process.child_conn.close()
 
 
 def _create_worker(settings: Settings, workers: int, digest: str | None = None) -> FastAPI:

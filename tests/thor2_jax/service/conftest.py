@@ -97,10 +97,11 @@ def unlabelled(scene: thor2.RGBDFrame) -> Files:
 
 
 SERVE = """
-import threading
+import signal, threading
 from thor2_jax.service import engine, pipeline
 engine.POINT_BUCKETS = (engine.MIN_BATCH_POINTS,)  # the tests send no larger clouds
 pipeline.compile_explanations = lambda *_: threading.Event().wait()  # a compilation that never ends
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup, it is ignored
 from training.cli import main
 main()
 """

@@ -40,7 +40,7 @@ def test_soak_without_errors_or_memory_growth(server: Any, files: Files) -> None
 
 
 @pytest.mark.parametrize("workers", [1, *slow(2)])
-@pytest.mark.parametrize("number", [signal.SIGTERM, *slow(signal.SIGINT)])
+@pytest.mark.parametrize("number", [signal.SIGTERM, *slow(signal.SIGINT, signal.SIGHUP)])
 def test_signals_answer_accepted_requests(
     number: signal.Signals, workers: int, start_server: Callable[..., Any], files: Files
 ) -> None:

@@ -85,35 +85,37 @@ def test_invalid_tokens(run_dir: Path, serve: Command, monkeypatch: pytest.Monke
 def test_ctrl_c_while_the_model_is_loaded(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An exception of Python's own handler can get lost there."""
     actions: list[Any] = []
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 
     def load(*_: object) -> None:
-        actions.extend(signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM))
+        actions.extend(map(signal.getsignal, numbers))
         raise InputError("ends the command")
 
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    before = [*map(signal.getsignal, numbers)]
     monkeypatch.setattr(server, "InferenceEngine", load)
     monkeypatch.setattr(server, "create_app", load)
     for workers in (1, 2):
         assert_refused("ends", server.serve, Settings(run_dir), port=0, workers=workers)
     assert actions == [signal.SIG_IGN if handler is signal.SIG_IGN else signal.SIG_DFL for handler in before] * 2
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    assert [*map(signal.getsignal, numbers)] == before
 
 
-@pytest.mark.parametrize("start", ["init_processes", "keep_subprocess_alive"])
-def test_workers_receive_no_ctrl_c_and_own_their_end_of_the_pipe(start: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_receive_no_ctrl_c_and_own_their_end_of_the_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
     """If a busy worker is killed, the health check ends at once; otherwise it would last for its timeout, a minute."""
     masks: list[set[signal.Signals]] = []
 
     def start_worker(supervisor: Any) -> None:
+        assert all(process.parent_conn.poll(0) for process in supervisor.processes)  # the end of the pipe
         masks.append(set(signal.pthread_sigmask(signal.SIG_BLOCK, ())))
         supervisor.processes = [Process(uvicorn.Config("no application"), [])]  # not started: it holds no pipe
 
-    monkeypatch.setattr(Multiprocess, start, start_worker)
     supervisor = object.__new__(server._Supervisor)
     supervisor.processes = []
-    getattr(supervisor, start)()
-    assert [(signal.SIGINT in mask, signal.SIGTERM in mask) for mask in masks] == [(True, False)]
-    assert supervisor.processes[0].parent_conn.poll(0)  # the end of the pipe
+    for start in ("init_processes", "keep_subprocess_alive", "keep_subprocess_alive"):
+        monkeypatch.setattr(Multiprocess, start, start_worker)
+        getattr(supervisor, start)()
+    blocked = {signal.SIGINT, signal.SIGHUP}
+    assert [mask & {signal.SIGTERM, *blocked} for mask in masks] == [blocked] * 3
 
 
 def test_preparation_processes_receive_no_signal_of_a_terminal() -> None:
@@ -123,7 +125,8 @@ def test_preparation_processes_receive_no_signal_of_a_terminal() -> None:
         "blocked = processes.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(); processes.close(); "
         "print(*sorted(blocked)); print(signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
     )
-    assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]
+    blocked = sorted(map(int, (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)))
+    assert finish_programs(start_program(code)) == [" ".join(map(str, blocked)) + "\nset()\n"]
 
 
 def test_metrics_of_workers_need_no_space_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,6 +149,22 @@ main()
 """
     (printed,) = finish_programs(start_program(code, "serve", "--model", run_dir, "--workers", 2, "--port", 0))
     assert printed and not Path(printed.strip()).parent.exists()
+
+
+def test_a_closed_terminal_ends_workers_except_under_nohup(run_dir: Path) -> None:
+    """Otherwise, uvicorn would replace the workers, also under `nohup`, and handle no other signal meanwhile."""
+    code = """
+import signal, sys
+from pathlib import Path
+from unittest import mock
+from thor2_jax.service import server
+server.InferenceEngine = mock.Mock()
+server._Supervisor.run = lambda self: (signal.raise_signal(signal.SIGHUP), print(*map(int, self.signal_queue)))
+for action in (signal.SIG_DFL, signal.SIG_IGN):
+    signal.signal(signal.SIGHUP, action)
+    server.serve(server.Settings(Path(sys.argv[1])), port=0, workers=2)
+"""
+    assert finish_programs(start_program(code, run_dir)) == [f"{int(signal.SIGTERM)}\n\n"]
 
 
 def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch, request: Any) -> None:
