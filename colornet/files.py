@@ -95,8 +95,7 @@ def temporary_directory(parent: str | Path) -> Iterator[Path]:
             marker.write(_MARKER_TEXT)
             yield directory
     finally:
-        for path in (*directory.glob("*"), directory):  # the marker last: it identifies what a killed process leaves
-            shutil.rmtree(path, ignore_errors=True)
+        _remove_temporary(directory)
 
 
 @contextlib.contextmanager
@@ -131,8 +130,13 @@ def remove_leftovers(directory: Path) -> None:
                     fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     is_left = marker.read() == _MARKER_TEXT
                 if is_left:  # remove it after closing the file, which network file systems would rename
-                    for each in (*path.glob("*"), path):
-                        shutil.rmtree(each, ignore_errors=True)
+                    _remove_temporary(path)
+
+
+def _remove_temporary(directory: Path) -> None:
+    """Remove a temporary directory; its marker, which identifies what a killed process leaves, after subdirectories."""
+    for path in (*directory.glob("*"), directory):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:

@@ -63,11 +63,13 @@ class FrameAnswer:
     def as_json(self) -> dict[str, Any]:
         """Return {"frame", "instances"} or {"frame", "error"}; recordings add "depth_gap", boxes and positions."""
         line: dict[str, Any] = {"frame": self.name}
-        instances = [dataclasses.asdict(answer) for answer in self.recognitions]
         if self.recorded is not None:
             line["depth_gap"] = self.recorded.gap / 1e9
-            instances = detections_as_json(self.detections)
-        return {**line, **({"instances": instances} if self.error is None else {"error": self.error})}
+        if self.error is not None:
+            return {**line, "error": self.error}
+        if self.recorded is not None:
+            return {**line, "instances": detections_as_json(self.detections)}
+        return {**line, "instances": [dataclasses.asdict(answer) for answer in self.recognitions]}
 
 
 def recognize_frames(
